@@ -170,7 +170,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     period = maps.texture_period(view.structure_tensor, constant)
     eta = maps.eta_map(params, statistics, view.camera, options)
     children = maps.children_map(params, counts, view.camera, options)
-    low = maps.share_map(params, is_low, view.camera, options)
+    low = maps.mean_map(params, is_low.float(), view.camera, options)
     panels = {
         name: Panel(f"{view.name}: {title}", scale(values), scale)
         for name, title, scale, values in (

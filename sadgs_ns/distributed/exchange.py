@@ -13,7 +13,6 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.world import World
 from sadgs_ns.gsplat_compat import drawn
-from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.types import Projected
 
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
@@ -37,7 +36,7 @@ class Exchange:
     """
 
     def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:
-        self.fused = projected.colors.shape[-1] == 3 and world.agree_once("kernels", lambda: use_triton(world.device))
+        self.fused = projected.colors.shape[-1] == 3 and world.uses_kernels
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([world.flags_out], device=world.device)])

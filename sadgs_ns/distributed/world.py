@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
 from sadgs_ns.errors import InputError
+from sadgs_ns.kernels import use_triton
 
 REBALANCED_BEYOND = 1.1
 """Shards are made equal if the largest has more than this many times the Gaussians of the smallest."""
@@ -37,13 +39,11 @@ class World:
         self.device = torch.device("cpu") if device is None else device
         self.sizes: list[int] = [0] * self.num_ranks
         self.flags_out = self.flags_in = 0
-        self._agreed: dict[str, bool] = {}
 
-    def agree_once(self, question: str, answer: Callable[[], bool]) -> bool:
-        """Return whether the `answer` of all processes was yes when they were first asked the question of this name."""
-        if question not in self._agreed:
-            self._agreed[question] = self.all(answer())
-        return self._agreed[question]
+    @cached_property
+    def uses_kernels(self) -> bool:
+        """Whether Triton's kernels work in all processes."""
+        return self.all(use_triton(self.device))
 
     @property
     def alone(self) -> bool:

@@ -246,10 +246,6 @@ class SadgsViewerConfig(ViewerConfig):
 
     websocket_host: str = "127.0.0.1"
     """Address at which the viewer listens: this machine only; 0.0.0.0 opens it to the network."""
-    websocket_port: int | None = None
-    """Port at which the viewer listens; None is 7007, or a free one where that is taken."""
-    quit_on_train_completion: bool = False
-    """End the command when training is done, instead of keeping the viewer open."""
 
 
 @hide("method_name", "prompt", "project_name", "relative_model_dir", "load_scheduler", "log_gradients")
@@ -263,8 +259,6 @@ class SadgsTrainerConfig(TrainerConfig):
     """Folder in which each run gets a folder of its own."""
     experiment_name: str | None = None
     """Name of the run's folder; None takes that of the data."""
-    timestamp: str = "{timestamp}"
-    """Name of the folder inside the experiment's and the method's; by default it is the time of the start."""
     machine: SadgsMachineConfig = field(default_factory=SadgsMachineConfig)
     """Device and seed."""
     pipeline: SadgsPipelineConfig = field(default_factory=SadgsPipelineConfig)
@@ -290,8 +284,6 @@ class SadgsTrainerConfig(TrainerConfig):
     If 100 times what the last one took is longer, that is waited."""
     steps_per_eval_batch: Suppress[int] = 0
     """Steps between losses on a held-out view; 0 is never."""
-    steps_per_eval_image: int = 500
-    """Steps between metrics of one held-out view, where a logger such as tensorboard is on."""
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
     data: Path | None = None

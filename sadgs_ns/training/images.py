@@ -21,8 +21,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.training.processes import processes_on_this_machine
 
 _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
-"""Takes a camera's data and image [H, W] or [H, W, C]; returns intrinsics in px [3, 3], image, and perhaps mask
-[H, W, 1] without distortion."""
+"""Takes data and image [H, W(, C)]; returns intrinsics in px [3, 3], image, and perhaps mask [H, W, 1] undistorted."""
 
 
 def thread_count(requested: int | None) -> int:
@@ -67,11 +66,9 @@ class LazyImages(Sequence[dict[str, Any]]):
         return len(self._names)
 
     def __getitem__(self, index: Any) -> Any:
-        """Decode an image and undistort it.
+        """Return `image` uint8 [H, W, 3 or 4], undistorted and on the CPU, and perhaps a boolean `mask` [H, W, 1].
 
-        Returns `image` uint8 [H, W, 3 or 4], contiguous and on the CPU, boolean `mask` [H, W, 1] if there is one, and
-        what else the dataset adds. Raises InputError if image or mask cannot be read, or has another size than
-        its camera.
+        Raises InputError if image or mask cannot be read, or has another size than its camera.
         """
         name, size, undistort = self._names[index], tuple(self._sizes[index]), self._undistort[index]
         try:
@@ -97,10 +94,9 @@ class LazyImages(Sequence[dict[str, Any]]):
         return {**data, "image": image}
 
     def _decode(self, image_idx: int) -> NDArray[np.uint8]:
-        """Decode an image as nerfstudio's `get_numpy_image`, a whole JPEG with OpenCV instead of Pillow. [H, W, 3 or 4]
+        """Decode an image as nerfstudio does, but a JPEG with OpenCV, unless its pixels differ. [H, W, 3 or 4]
 
-        For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms. Both use
-        libjpeg-turbo, perhaps in two versions, so OpenCV is used only if the pixels of the first JPEG are equal.
+        For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms.
         """
         content, image = self._names[image_idx].read_bytes(), None
         if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":

@@ -97,21 +97,17 @@ def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device
 
 
 def fit_to_memory(
-    cap: int, params: Params, size: TrainingSize, budget_gb: float | None = None, processes: int = 1
+    cap: int,  # The strategy's `max_gaussians`
+    params: Params,  # The initial Gaussians of this process, one of `processes` with equal parts and a device each
+    size: TrainingSize,
+    budget_gb: float | None = None,  # Of each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free
+    processes: int = 1,
 ) -> tuple[int, str]:
     """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
     A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
-    `max_gaussians` is lowered; without CUDA, nothing is.
-
-    Args:
-        cap: The strategy's `max_gaussians`.
-        params: The initial Gaussians of this process, one of `processes` with equal parts and a device each.
-        size: What the run keeps and renders besides.
-        budget_gb: Memory for the run on each device, in 10⁹ bytes; None is `PLANNED_SHARE` of what is free.
-
-    Returns:
-        The cap and a line for the user. Raises InputError if the budget leaves no room for Gaussians.
+    `max_gaussians` is lowered; without CUDA, nothing is. Returns the cap and a line for the user. Raises InputError if
+    the budget leaves no room for Gaussians.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)

@@ -291,10 +291,8 @@ class SadgsModel(SplatfactoModel):
             warn_once(str(error))
             width, height = int(camera.width.item()), int(camera.height.item())
             outputs = self.get_empty_outputs(width, height, self.background)
-        if self.viewer_outputs is not None:
-            outputs = outputs | self.viewer_outputs(camera, outputs)
         if in_viewer():
-            return outputs
+            return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
 

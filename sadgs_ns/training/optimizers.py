@@ -39,8 +39,8 @@ class FusedAdam(Adam):
 class AdamUpdate:
     """An update of parameters, given by name, by our kernel, or else by torch's fused Adam, all on one device.
 
-    One launch updates all parameters of one length with equal betas and eps: six optimizers took the host a quarter of
-    a step of 300k Gaussians. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
+    One launch of the kernel updates all parameters of one length with equal betas and eps, which spares the host's
+    time. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
     """
 
     def __init__(self, optimizers: Mapping[str, Adam]) -> None:

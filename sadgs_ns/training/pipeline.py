@@ -32,7 +32,7 @@ from sadgs_ns.training.structure_cache import StructureCache
 from sadgs_ns.training.train_step import StepResult, ViewGroup
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
-from sadgs_ns.viewer.elements import in_viewer, shows_output
+from sadgs_ns.viewer.elements import shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
 _NAMED_STEPS = 5
@@ -83,8 +83,6 @@ class SadgsPipeline(VanillaPipeline):
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the panels' pictures and normals, which cannot be lazy while training changes the Gaussians."""
-        if not in_viewer():
-            return {}
         shown = shows_output(self.structure.viewer, NORMALS)
         normals = {NORMALS: self.model.get_normals(camera) if shown else rendered["rgb"]}
         return normals | self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)

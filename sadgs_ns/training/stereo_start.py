@@ -49,17 +49,10 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     cameras = pipeline.datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
     assert model.seed_points is not None
-    points = model.seed_points[0]
+    points, Ks = model.seed_points[0], cameras.get_intrinsics_matrices()
+    points = points[plausible_points(points)].to(model.device)
     masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in data]
-    depths = depth_maps(
-        lambda view: data[view]["image"],
-        viewmats,
-        cameras.get_intrinsics_matrices(),
-        points[plausible_points(points)].to(model.device),
-        masks=masks,
-        device=model.device,
-    )
-
+    depths = depth_maps(lambda view: data[view]["image"], viewmats, Ks, points, masks=masks, device=model.device)
     photos, wavelengths = lambda i: cache.photo(data[i])[..., :3], lambda i: wavelength(dequantize(cache[i]))
     added = model.add_points(*dense_points(depths, viewmats, photos, wavelengths, number))
     if model.device.type == "cuda":

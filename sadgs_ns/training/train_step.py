@@ -61,24 +61,16 @@ class StepResult:
 def training_step(
     model: SadgsModel,
     groups: Sequence[ViewGroup],
-    opacity_reg: float,
-    update: AdamUpdate,
-    factors: Tensor,
-    nonfinite_flag: Tensor,
+    opacity_reg: float,  # Factor on the mean opacity in the loss
+    update: AdamUpdate,  # The update of all parameters
+    factors: Tensor,  # What `AdamUpdate.factors` returned, on the device
+    nonfinite_flag: Tensor,  # Becomes NaN if a gradient was not finite. float32 [1]
 ) -> StepResult:
-    """Train on the views of a step. This enqueues work and changes tensors only. It waits for none of it,
-    but in several processes, for the numbers of Gaussians that they send each other.
+    """Train on the views of a step; the loss is their mean. This enqueues work and changes tensors only.
 
-    If the tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups,
-    neither parameters nor moments change.
-
-    Args:
-        model: The model, in training, whose strategy sees the views.
-        groups: The views; the loss is the mean over all of them.
-        opacity_reg: Factor on the mean opacity in the loss.
-        update: The update of all parameters.
-        factors: What `AdamUpdate.factors` returned, on the device.
-        nonfinite_flag: Becomes NaN if a gradient was not finite. float32 [1]
+    It waits for none of it, but in several processes, for the numbers of Gaussians that they send each other. If the
+    tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups, neither
+    parameters nor moments change.
     """
     strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
     # Gradients of the parameters themselves would be added up on the stream of their first use, where no graph is

@@ -102,11 +102,10 @@ class TrainingViews:
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
     def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
-        """Draw the views of a step, and prefetch images of the next ones. Raises as `ImagePrefetcher.take`.
+        """Return index and data of each view of the next step, and prefetch images of later ones.
 
-        Returns:
-            Index and data of each view. The image is on the training device, and so is the mask if it was prefetched.
-            With several processes, prefetched data is there only of views that this process composites.
+        The image is on the training device, and so is the mask if it was prefetched. With several processes, prefetched
+        data is there only of views that this process composites. Raises as `ImagePrefetcher.take`.
         """
         indices, prefetcher = self.sampler.draw(number), self.prefetcher
         if prefetcher is None:

@@ -18,7 +18,7 @@ from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measu
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
-from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
+from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
 OUTPUT = "cleaned"
 """Name of the panel's picture among the viewer's output types."""
@@ -104,9 +104,7 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `cleaned` [H, W, 3] in [0, 1] in the viewer; it is `rgb` once densification changed the Gaussians."""
-        if not in_viewer():
-            return {}
+        """Return `cleaned` [H, W, 3] in [0, 1]; it is `rgb` once densification changed the Gaussians."""
         model, stays = self._model, self._stays
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}

@@ -116,11 +116,10 @@ class Panel:
     scale: Scale | None = None
 
 
-def draw(path: Path, panels: Sequence[Panel], columns: int | None = None) -> None:
+def draw(path: Path, panels: Sequence[Panel], columns: int) -> None:
     """Write pictures, at least one, with titles and colour bars in rows of `columns` as PNG, or raise WriteError."""
     from matplotlib.figure import Figure
 
-    columns = len(panels) if columns is None else columns
     rows = math.ceil(len(panels) / columns)
     height, width = panels[0].picture.shape[:2]
     side = 8.0 if len(panels) == 1 else 4.5

@@ -44,31 +44,33 @@ def blend(
     return render[0], alpha[0]
 
 
+def mean_map(
+    params: Mapping[str, Tensor],
+    values: Tensor,  # [N]
+    camera: Cameras,
+    drawing: RenderOptions = DEFAULTS,
+    known: Tensor | None = None,  # Which Gaussians have a value; None is all. bool [N]
+) -> Tensor:
+    """Return the mean value of what is drawn at each pixel. [H, W]"""
+    weights = torch.ones_like(values) if known is None else known.float()
+    total, cover = blend(params, torch.stack([weights * values, weights], dim=-1), camera, drawing)[0].unbind(-1)
+    return torch.where(cover > MIN_COVER, total / cover, torch.nan)
+
+
 def eta_map(
     params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
     """Return the geometric mean of the largest η of the Gaussians observed (`eta_max`, `n_total`). [H, W]"""
     largest = statistics["eta_max"].amax(dim=1)
-    known = ((statistics["n_total"] > 0) & (largest > 0)).float()
-    values = torch.stack([torch.where(known > 0, largest, 1.0).log(), known], dim=-1)
-    total, cover = blend(params, values, camera, drawing)[0].unbind(-1)
-    return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)
+    known = (statistics["n_total"] > 0) & (largest > 0)
+    return mean_map(params, torch.where(known, largest, 1.0).log(), camera, drawing, known).exp()
 
 
 def children_map(
     params: Mapping[str, Tensor], counts: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
     """Return the geometric mean of the Gaussians' numbers of children, ≥ 1 along each axis [N, 3]. [H, W]"""
-    total, cover = blend(params, num_children(counts)[:, None].float().log(), camera, drawing)
-    return torch.where(cover > MIN_COVER, (total / cover).exp(), torch.nan)[..., 0]
-
-
-def share_map(
-    params: Mapping[str, Tensor], chosen: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
-) -> Tensor:
-    """Return the share of the chosen Gaussians, bool [N], in what is drawn at each pixel. [H, W]"""
-    total, cover = blend(params, chosen[:, None].float(), camera, drawing)
-    return torch.where(cover > MIN_COVER, total / cover, torch.nan)[..., 0]
+    return mean_map(params, num_children(counts).float().log(), camera, drawing).exp()
 
 
 @torch.no_grad()
@@ -126,16 +128,10 @@ class Ellipses:
     spacing: float  # Distance between neighbouring centres in px
 
 
-def structure_ellipses(
-    structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT, spacing: float | None = None
-) -> Ellipses:
-    """Return S̄⁻¹ at the textured pixels of a regular grid.
-
-    S̄ is (xx, xy, yy) in 1/px² [H, W, 3], and c in 1/px. The grid's spacing is in px and ≥ 1; None puts
-    `ELLIPSES_ACROSS` along the shorter side.
-    """
+def structure_ellipses(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Ellipses:
+    """Return S̄⁻¹ at the textured pixels of a regular grid. S̄ is (xx, xy, yy) in 1/px² [H, W, 3], and c in 1/px."""
     height, width = structure_tensor.shape[:2]
-    spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0) if spacing is None else spacing
+    spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0)
     y, x = torch.meshgrid(
         torch.arange(spacing / 2, height, spacing), torch.arange(spacing / 2, width, spacing), indexing="ij"
     )

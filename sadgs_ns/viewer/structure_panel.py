@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -34,7 +35,7 @@ from sadgs_ns.training.run_plan import RunPlan
 from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
-from sadgs_ns.viewer.elements import ViewerMarkdown, in_viewer, show_output
+from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""
@@ -100,26 +101,17 @@ class StructurePanel(torch.nn.Module):
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
         self._status, self._shown, self._legend = "", OFF, ""
-        strategy, hint = self._model.strategy, "What the output type “structure” shows"
+        hint = "What the output type “structure” shows"
         self.choice = ViewerDropdown("Show", OFF, CHOICES, cb_hook=lambda _: self._call(self.choose), hint=hint)
         self.legend = ViewerMarkdown("legend", lambda: self._legend)
         self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._call(self.observe_now))
-        self.set_max_gaussians = ViewerNumber(
-            "max_gaussians",
-            strategy.max_gaussians,
-            cb_hook=lambda element: self._change("max_gaussians", element),
-            hint="Hard cap, from the next densification on",
-        )
-        low, high = RANGES["tau_split"]
-        self.set_tau_split = ViewerSlider(
-            "tau_split",
-            strategy.tau_split,
-            min(low, strategy.tau_split),  # The run's options may lie beyond the range.
-            max(high, strategy.tau_split),
-            0.05,
-            cb_hook=lambda element: self._change("tau_split", element),
-            hint="Share of observations that must violate, at the next structure step",
-        )
+        name, value = "max_gaussians", self._model.strategy.max_gaussians
+        hint = "Hard cap, from the next densification on"
+        self.set_max_gaussians = ViewerNumber(name, value, cb_hook=partial(self._change, name), hint=hint)
+        name, value = "tau_split", self._model.strategy.tau_split
+        hint = "Share of observations that must violate, at the next structure step"
+        hook, (low, high) = partial(self._change, name), RANGES[name]
+        self.set_tau_split = ViewerSlider(name, value, low, high, 0.05, cb_hook=hook, hint=hint)
         self.table = ViewerMarkdown("counts", self._describe)
         self.viewer = ViewerControl()
 
@@ -225,9 +217,7 @@ class StructurePanel(torch.nn.Module):
         show_output(self.viewer, "rgb" if chosen == OFF else OUTPUT)
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `structure` [H, W, 3] in [0, 1] in the viewer, whatever is chosen: its thread needs each output."""
-        if not in_viewer():
-            return {}
+        """Return `structure` [H, W, 3] in [0, 1], whatever is chosen: the viewer's thread needs each output."""
         if self._shown == OFF:
             return {OUTPUT: rendered["rgb"]}
         drawn = self.picture(self._shown, camera, rendered["rgb"])
@@ -289,6 +279,6 @@ class StructurePanel(torch.nn.Module):
             split = int((kept["children"] > 1).any(dim=1).sum())
             text = f"children at a structure step now: {split:,} Gaussians would split ({seen})"
         else:
-            drawn, scale = maps.share_map(rows, rows["low"], pinhole, model.drawing), LOW
+            drawn, scale = maps.mean_map(rows, rows["low"].float(), pinhole, model.drawing), LOW
             text = f"share of consistently low Gaussians, {int(kept['low'].sum()):,} in all ({seen})"
         return Panel(text, scale(drawn), scale)

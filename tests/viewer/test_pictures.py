@@ -83,8 +83,9 @@ def test_masked_pixels_are_drawn_as_those_without_texture():
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 135])
-def test_ellipses_are_short_across_the_stripes_and_long_along_them(degrees: int):
-    ellipses = maps.structure_ellipses(structure_tensor(grating(8.0, math.radians(degrees))), spacing=16.0)
+def test_ellipses_are_short_across_the_stripes_and_long_along_them(degrees: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(maps, "ELLIPSES_ACROSS", HEIGHT / 16)
+    ellipses = maps.structure_ellipses(structure_tensor(grating(8.0, math.radians(degrees))))
     assert len(ellipses.centers) == (HEIGHT // 16) * (WIDTH // 16)
     off = torch.remainder(ellipses.angles - math.radians(degrees) + math.pi / 2, math.pi) - math.pi / 2
     assert off.abs().max() < math.radians(5)
@@ -93,11 +94,13 @@ def test_ellipses_are_short_across_the_stripes_and_long_along_them(degrees: int)
     assert (ellipses.axes <= ellipses.longest).all()
 
 
-def test_ellipses_are_drawn_where_and_as_they_lie():
+def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatch):
     """Of vertical stripes each ellipse is a tall one: coloured pixels reach further up and down than to the sides."""
     tensor = torch.zeros(40, 40, 3)
     tensor[20, 20] = torch.tensor([0.4**2, 0.0, 0.4**2 / 25])  # axes of 2.5 and 12.5 px
-    ellipses = maps.structure_ellipses(tensor, 0.4, spacing=40.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(maps, "ELLIPSES_ACROSS", 1)
+        ellipses = maps.structure_ellipses(tensor, 0.4)
     assert ellipses.centers.tolist() == [[20.0, 20.0]]
     torch.testing.assert_close(ellipses.axes, torch.tensor([[2.5, 12.5]], dtype=torch.float64), rtol=1e-3, atol=0)
     tensor[:] = tensor[20, 20]
@@ -145,7 +148,7 @@ def test_children_and_low_gaussians_are_seen_where_they_are():
     counts = torch.tensor([[2, 3, 1], [1, 1, 1]])
     children = maps.children_map(wall(), counts, view())
     assert float(children[24, 17]) == pytest.approx(6.0, rel=1e-3) and float(children[24, 47]) == pytest.approx(1.0)
-    low = maps.share_map(wall(), torch.tensor([False, True]), view())
+    low = maps.mean_map(wall(), torch.tensor([0.0, 1.0]), view())
     assert float(low[24, 17]) == pytest.approx(0.0) and float(low[24, 47]) == pytest.approx(1.0)
     assert CHILDREN(children).shape == LOW(low).shape == (48, 64, 3)
 
@@ -184,7 +187,7 @@ def test_a_legend_has_the_scale_s_colours_and_numbers_as_an_image_in_its_text():
 def test_figures_are_written_whole_with_all_panels(tmp_path: Path):
     panels = [Panel("a", np.zeros((20, 30, 3), np.uint8), PERIOD), Panel("b", np.zeros((20, 30, 3), np.uint8))] * 2
     color_scales.draw(tmp_path / "new" / "four.png", panels, columns=2)
-    color_scales.draw(tmp_path / "one.png", panels[:1])
+    color_scales.draw(tmp_path / "one.png", panels[:1], columns=1)
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["four.png"]
     with Image.open(tmp_path / "new" / "four.png") as four, Image.open(tmp_path / "one.png") as one:
         assert four.height > one.height > 0
