@@ -36,7 +36,7 @@ class Exchange:
     """
 
     def __init__(self, world: World, projected: Projected, bands: Sequence[Band]) -> None:
-        self.fused = projected.colors.shape[-1] == 3 and world.uses_kernels
+        self.fused = world.uses_kernels
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
         counted = torch.cat([reached.sum(1), torch.tensor([world.flags_out], device=world.device)])
@@ -105,11 +105,10 @@ class _Exchanged(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, exchange: Exchange, absgrad: bool, *projected: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
-        _, means2d, _, _, opacities, colors = projected
+        _, means2d, _, _, opacities, _ = projected
         ctx.set_materialize_grads(False)
         ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
         ctx.save_for_backward(means2d)
-        ctx.num_colors = colors.shape[-1]
         if exchange.fused:
             from sadgs_ns.kernels import exchange as kernel  # Triton need not be installed.
 
@@ -120,10 +119,7 @@ class _Exchanged(torch.autograd.Function):
         for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
             if not len(received):
                 received = received.new_zeros((1, received.shape[1]))  # A Gaussian whose radius is 0 is not drawn.
-            if kernel is None:
-                part = unpack(received, ctx.num_colors, band.top)
-            else:
-                part = kernel.unpack(received.contiguous(), band.top)
+            part = unpack(received, band.top) if kernel is None else kernel.unpack(received.contiguous(), band.top)
             ctx.mark_non_differentiable(part[0])
             outputs += part
         return means2d.new_zeros(()), *outputs
@@ -133,7 +129,7 @@ class _Exchanged(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         exchange: Exchange = ctx.exchange
         (means2d,) = ctx.saved_tensors
-        widths = list(_GRADIENTS) if exchange.fused else [2, 3, 1, ctx.num_colors, *[2] * ctx.absgrad]
+        widths = list(_GRADIENTS) if exchange.fused else [2, 3, 1, 3, *[2] * ctx.absgrad]
         parts = []
         for i in range(len(exchange.bands)):
             number = sum(row[i] for row in exchange.counts)
@@ -157,7 +153,7 @@ class _Exchanged(torch.autograd.Function):
 def pack(projected: Sequence[Tensor], places: Tensor) -> Tensor:
     """Return rows of centre, conic, opacity, colour, depth and radius of the Gaussians at some places in V · N.
 
-    `projected` are the six tensors of `Projected`. int64 [M] → [M, 7 + D + 1 or 2]
+    `projected` are the six tensors of `Projected`. int64 [M] → [M, 10 + 1 or 2]
     """
     radii, means2d, depths, conics, opacities, colors = projected
     size = opacities.numel()
@@ -165,13 +161,12 @@ def pack(projected: Sequence[Tensor], places: Tensor) -> Tensor:
     return _beside([*taken[:-1], taken[-1].to(means2d.dtype)])
 
 
-def unpack(rows: Tensor, num_colors: int, top: int) -> tuple[Tensor, ...]:
-    """Return the six tensors of `Projected` of one view from rows of `pack` with D colours; centres are counted from
-    row `top`."""
-    per_gaussian = rows.shape[1] - 7 - num_colors
+def unpack(rows: Tensor, top: int) -> tuple[Tensor, ...]:
+    """Return the six tensors of `Projected` of one view from rows of `pack`; centres are counted from row `top`."""
+    per_gaussian = rows.shape[1] - 10
     means2d, conics, opacities, colors, depths, radii = (
         column.clone(memory_format=torch.contiguous_format)
-        for column in rows[None].split([2, 3, 1, num_colors, 1, per_gaussian], dim=-1)
+        for column in rows[None].split([2, 3, 1, 3, 1, per_gaussian], dim=-1)
     )
     means2d[..., 1] -= top
     radii = radii.int() if per_gaussian == 2 else radii[..., 0].int()

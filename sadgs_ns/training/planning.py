@@ -76,8 +76,10 @@ def plan_run(
         warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
     if strategy.refine_stop_iter != 0:
         cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
-        if before is not None and all(requested[name] == before.requested[name] for name in _CAP_OPTIONS):
-            cap = _kept_cap(cap, before.strategy.max_gaussians)
+        same = all(requested[name] == old[name] for name in _CAP_OPTIONS)
+        if before is not None and same and cap > before.strategy.max_gaussians:
+            cap = before.strategy.max_gaussians
+            note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
     growth, more = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
     clone, split = growth * strategy.clone_grad2d * more, growth * strategy.split_absgrad2d * more
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
@@ -137,15 +139,3 @@ def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views:
     cap, line = fit_to_memory(cap, params, size, options.memory_budget_gb, world.num_ranks)
     note(line)
     return int(world.least(cap))
-
-
-def _kept_cap(now: int, before: int) -> int:
-    """Return the cap of a resumed run, and print a line if memory now allows more, or less."""
-    if now < before:
-        warn(
-            f"The checkpoint's run had room for {before:,} Gaussians, the GPU's free memory now has for {now:,}, which "
-            f"is the cap from here on: stop this run and end other programs on the GPU to keep {before:,}."
-        )
-    elif now > before:
-        note(f"At most {before:,} Gaussians, as in the checkpoint's run.")
-    return min(now, before)

@@ -27,7 +27,7 @@ def test_rows_are_torchs_and_give_the_gaussians_back(per_axis_radii: bool, numbe
     assert torch.equal(kernels.pack(*projected, places), rows)
     for top in (0, 48):
         taken = kernels.unpack(rows, top)
-        for name, value, expected in zip(Projected._fields[:6], taken, exchange.unpack(rows, 3, top), strict=True):
+        for name, value, expected in zip(Projected._fields[:6], taken, exchange.unpack(rows, top), strict=True):
             assert value.is_contiguous() and value.dtype == expected.dtype, name
             torch.testing.assert_close(value, expected, rtol=0, atol=0)
     taken = kernels.unpack(rows, 0)
