@@ -87,8 +87,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
     None does so where there are at most 60 training views."""
     initial_opacity: float = POINT_OPACITY
-    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1.
-    Half opaque ones mostly have a lower LPIPS and make more Gaussians (docs/results.md)."""
+    """Opacity at which SfM points start, in (0, 1); random ones start at 0.1."""
     sh_degree: int = 3
     """Degree of the spherical harmonics that make colours depend on the direction of view, 0 to 3."""
     ssim_lambda: float = 0.6
@@ -109,8 +108,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
     color_model: Literal["none", "affine"] = "none"
-    """What is learned of each training photo's exposure and white balance, which held-out views are rendered without.
-    "affine" is a colour matrix."""
+    """Whether a colour matrix of each training photo is learned; held-out views are rendered without one."""
     color_corrected_metrics: bool = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
 
@@ -269,8 +267,7 @@ class SadgsTrainerConfig(TrainerConfig):
     """Length of the run in optimizer steps; None derives it from the number of views and `pipeline.effort`.
     Densification and the learning rates' schedules stretch to it."""
     rates_follow_views: bool = True
-    """Whether the rates of positions, opacities, scales and rotations, set for one view a step, change with more views.
-    The mean over more views is less noisy, so that they may be higher, and fall further."""
+    """Whether rates of positions, opacities, scales and rotations, set for one view a step, change with more views."""
     cuda_graphs: bool = True
     """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
     Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/results.md)."""
@@ -361,7 +358,6 @@ class SadgsTrainerConfig(TrainerConfig):
         if device == "cuda" and not torch.cuda.is_available():
             problem = "machine.device_type is cuda, but torch finds no CUDA device"
             raise InputError(f"{problem}: set it to cpu, or install torch for CUDA.")
-        check_ranges("machine.", self.machine, [("seed", 0 <= self.machine.seed < 2**32, "in [0, 2³²)")])
         model, several = self.pipeline.model, processes.check_devices(self.machine)
         if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
             choose_backend(model.backend, torch.device(device), not several)

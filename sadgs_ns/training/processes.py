@@ -21,6 +21,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
+from sadgs_ns.training.options import check_ranges
 
 _REAPED_SECONDS = 5.0
 """Longest time from a message that fails because its receiver has ended until the system forgets the receiver."""
@@ -50,13 +51,13 @@ def least(number: float, device: torch.device) -> float:
 
 def check_devices(machine: MachineConfig) -> bool:
     """Return whether a run takes several devices; raise InputError if they are missing or cannot be started."""
-    if machine.num_machines != 1:
-        raise InputError(
-            f"machine.num_machines is {machine.num_machines}, and sadgs trains on several machines with torchrun: "
-            "start `torchrun --nnodes … --nproc-per-node … -m nerfstudio.scripts.train sadgs …` on each of them."
-        )
-    if machine.num_devices < 1:
-        raise InputError(f"machine.num_devices must be at least 1, got {machine.num_devices}.")
+    torchrun = "1, since `torchrun --nnodes … -m nerfstudio.scripts.train sadgs …` on each of them starts such a run"
+    ranges = [
+        ("num_machines", machine.num_machines == 1, torchrun),
+        ("num_devices", machine.num_devices >= 1, "at least 1"),
+        ("seed", 0 <= machine.seed < 2**32, "in [0, 2³²)"),
+    ]
+    check_ranges("machine.", machine, ranges)
     if machine.num_devices > 1 and machine.device_type != "cuda":
         raise InputError(
             f"machine.num_devices is {machine.num_devices}, and nerfstudio starts several processes with CUDA only: "

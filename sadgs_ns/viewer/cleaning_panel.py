@@ -5,7 +5,7 @@ It removes nothing: `sadgs-export` does, with the options that the panel prints.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -25,16 +25,6 @@ OUTPUT = "cleaned"
 OFF, STAYS, GOES = "off", "what stays", "what goes"
 NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
 """Corners of the box at first, in world units, which crop nothing."""
-
-
-@dataclass(frozen=True)
-class _DrawnRows:
-    """A crop box for the model that holds the drawn Gaussians, bool [N]."""
-
-    drawn: Tensor
-
-    def within(self, means: Tensor) -> Tensor:
-        return self.drawn
 
 
 class CleaningPanel(torch.nn.Module):
@@ -109,7 +99,8 @@ class CleaningPanel(torch.nn.Module):
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
         box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays
-        model.crop_box = _DrawnRows(drawn if box is None else drawn & box.within(model.means))  # type: ignore[assignment]
+        drawn = drawn if box is None else drawn & box.within(model.means)
+        model.crop_box = SimpleNamespace(within=lambda means: drawn)  # type: ignore[assignment]
         try:
             return {OUTPUT: model.get_outputs(camera)["rgb"]}
         finally:

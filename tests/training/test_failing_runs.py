@@ -66,7 +66,7 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             "machine.num_devices is 2, and nerfstudio starts several processes with CUDA only",
         ),
         ("machine.num_devices", 0, "machine.num_devices must be at least 1, got 0."),
-        ("machine.num_machines", 2, "machine.num_machines is 2, and sadgs trains on several machines with torchrun: "),
+        ("machine.num_machines", 2, "machine.num_machines must be 1, since `torchrun --nnodes … "),
         ("machine.device_type", "cuda", "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu,"),
         (
             "pipeline.datamanager.cache_images_type",
