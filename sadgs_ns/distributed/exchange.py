@@ -62,10 +62,8 @@ class Exchange:
         """Send the Gaussians, differentiably; call once.
 
         With `absgrad`, `backward` sets `absgrad` and `grad2d` of `means2d`, its absolute gradients and its gradient.
-
-        Returns:
-            Zero, which must be added to the loss so that gradients come to a process that composites nothing; and the
-            Gaussians of each band of this process, one view each, shifted to the first drawn row.
+        Returns zero, which must be added to the loss so that gradients come to a process that composites nothing; and
+        the Gaussians of each band of this process, one view each, shifted to the first drawn row.
         """
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.

@@ -31,11 +31,9 @@ def rasterize(
     are those of this process, and `world.sizes` must be right. Several processes wait for the exact lengths of tile
     lists, and give `viewmats` no gradient. Raises InputError as `render.rasterization.rasterize`.
 
-    Returns:
-        The pictures that this process composited, a single one of everything where it is alone; and the `info` of this
-        process's Gaussians in all views. With several processes, `info` has `anchor`, a zero that must be added to the
-        loss; `num_pairs` and `num_pixels` that this process composited; and, after `backward` with `absgrad`, `absgrad`
-        and `grad2d` of `means2d`.
+    Returns the pictures that this process composited, a single one of everything where it is alone, and the `info` of
+    its Gaussians in all views. With several processes, `info` has `anchor`, which `Exchange.send` returns, and
+    `num_pairs` and `num_pixels` that this process composited.
     """
     if world.alone:
         colors, alphas, info = render.rasterize(gaussians, cameras, options)

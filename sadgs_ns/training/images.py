@@ -119,18 +119,17 @@ def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
         return undistorts
     fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
     rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
-    _, firsts, numbers = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    for number, first in enumerate(firsts.tolist()):
-        if not distortion[first].any():
-            continue
-        undistort = _undistort_as(cameras[first].reshape(()))
-        # The new intrinsics do not depend on the pixels.
-        K, image, _ = undistort({}, np.zeros((int(cameras.height[first]), int(cameras.width[first])), np.uint8))
-        for index in np.flatnonzero(numbers.reshape(-1) == number).tolist():
-            undistorts[index] = undistort
-            cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
-            cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
-            cameras.width[index], cameras.height[index] = image.shape[1], image.shape[0]
+    known: dict[bytes, tuple[_Undistort, NDArray[np.float32], NDArray[Any]]] = {}
+    for index in distortion.any(dim=-1).nonzero().flatten().tolist():
+        if (row := rows[index].tobytes()) not in known:
+            undistort = _undistort_as(cameras[index].reshape(()))
+            # The new intrinsics do not depend on the pixels.
+            empty = np.zeros((int(cameras.height[index]), int(cameras.width[index])), np.uint8)
+            known[row] = undistort, *undistort({}, empty)[:2]
+        undistorts[index], K, image = known[row]
+        cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
+        cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
+        cameras.width[index], cameras.height[index] = image.shape[1], image.shape[0]
     return undistorts
 
 
@@ -144,8 +143,8 @@ def _undistort_as(camera: Cameras) -> _Undistort:
 class ImagePrefetcher:
     """Copies images from the host to the device ahead of the step that needs them, on its own stream.
 
-    Threads decode images, and copy them to pinned memory, which torch reuses for later images. Without CUDA only
-    decoding runs ahead. `images` are decoded ones or `LazyImages`; if they are `decoded`, no thread is needed.
+    Threads decode `LazyImages` and copy them to pinned memory; images that are `decoded` need none. Without CUDA only
+    decoding runs ahead.
     """
 
     def __init__(self, images: Sequence[Mapping[str, Any]], device: torch.device, threads: int) -> None:

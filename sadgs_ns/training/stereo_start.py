@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
-import torch
-
 from sadgs_ns.method.dense_start import NUMBER, dense_points
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.initialization import plausible_points
@@ -45,7 +41,7 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     if not number or resumed:
         return number > 0
     model, cache = pipeline.model, pipeline.structure_cache
-    data, started = pipeline.datamanager.cached_train, time.perf_counter()  # Undistorting images changes cameras.
+    data = pipeline.datamanager.cached_train  # Undistorting images changes cameras.
     cameras = pipeline.datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
     assert model.seed_points is not None
@@ -55,11 +51,6 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     depths = depth_maps(lambda view: data[view]["image"], viewmats, Ks, points, masks=masks, device=model.device)
     photos, wavelengths = lambda i: cache.photo(data[i])[..., :3], lambda i: wavelength(dequantize(cache[i]))
     added = model.add_points(*dense_points(depths, viewmats, photos, wavelengths, number))
-    if model.device.type == "cuda":
-        torch.cuda.synchronize()
     known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)
-    note(
-        f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points "
-        f"({time.perf_counter() - started:.1f} s)."
-    )
+    note(f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points.")
     return True

@@ -159,8 +159,8 @@ class SadgsTrainer(Trainer):
     def train(self) -> None:
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
 
-        Raises RunError if memory is full, the run has diverged, or an image cannot be decoded any more; WriteError if
-        a checkpoint or log could not be written; SystemExit after a signal, once a checkpoint is saved.
+        Raises RunError if memory is full or the run has diverged; InputError if an image cannot be decoded any more;
+        WriteError if a checkpoint or log could not be written; SystemExit after a signal, once a checkpoint is saved.
         """
         total = self.pipeline.model.plan.iterations
         self.step: int = max(self._start_step - 1, 0)  # names the checkpoint if nothing is left to do
@@ -176,13 +176,8 @@ class SadgsTrainer(Trainer):
         events.report("loop begins")
         try:
             self._train_until_interrupted(total)
-        except InputError as error:
-            if self._completed_step == self._saved_step or not self.world.alone:
-                raise
-            # An image that is decoded ahead of its step is gone or damaged, and no step is half done.
-            self.save_checkpoint(self._completed_step)
-            message = f"{error} What was trained is saved and goes on with --load-dir {self.checkpoint_dir}."
-            raise RunError(message) from error
+        except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
+            raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
         except RunError:
             raise
         except torch.cuda.OutOfMemoryError as error:
