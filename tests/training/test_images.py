@@ -39,6 +39,8 @@ LENSES = {
     "perspective": {"camera_model": "OPENCV", "k1": 0.1, "k2": -0.02, "p1": 0.003, "p2": -0.002},
     "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": 0.01, "k3": 0.002, "k4": 0.001},
 }
+nerfstudio_leaves_files_open = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+"""It opens an image with Pillow, which closes the file only where the image can be decoded."""
 
 
 def distorted(folder: Path, kind: str, masks: bool) -> DataParserConfig:
@@ -150,7 +152,7 @@ def test_jpegs_are_decoded_by_opencv_only_if_it_agrees_with_pillow(
     assert by_pillow == ([0] if agrees else 2 * list(range(VIEWS - 1)))
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # nerfstudio leaves the file open.
+@nerfstudio_leaves_files_open
 def test_a_file_that_breaks_later_is_named(tmp_path: Path):
     read = datamanager_of(nerfstudio_data(tmp_path, masks=True), cache_images="compressed")
     assert len(list(read.cached_train)) == len(read.train_dataset)
@@ -264,6 +266,7 @@ def test_an_image_that_breaks_during_the_run_ends_it_in_one_sentence(tmp_path: P
     assert int(saved.stem.removeprefix("step-")) >= 4
 
 
+@nerfstudio_leaves_files_open
 def test_an_image_that_is_broken_at_the_start_ends_the_run_in_one_sentence(tmp_path: Path):
     parser = nerfstudio_data(tmp_path / "data")
     config = configure(tmp_path, parser, ITERATIONS)
