@@ -315,9 +315,8 @@ class SadgsTrainerConfig(TrainerConfig):
         from nerfstudio.configs.method_configs import all_methods  # It imports this module.
 
         preset = all_methods.get(self.method_name or "", self)
-        if lost := [
-            name for name, value in vars(preset).items() if vars(self)[name] != value and name != "load_config"
-        ]:
+        given = {name for name, value in vars(preset).items() if vars(self)[name] != value}
+        if lost := sorted(given - {"load_config"}):
             raise InputError(
                 f"With --load-config all options come from its file, and others are not read, here of "
                 f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
@@ -338,16 +337,13 @@ class SadgsTrainerConfig(TrainerConfig):
             ("mixed_precision", not self.mixed_precision, "False, since sadgs trains in float32"),
             ("use_grad_scaler", not self.use_grad_scaler, "False, since sadgs trains in float32"),
             ("log_gradients", not self.log_gradients, "False, since gradients are freed in each step"),
+            ("load_step", self.load_step is None or self.load_dir is not None, "left out unless load_dir names a run"),
             ("gradient_accumulation_steps", not accumulated, "1: pipeline.views_per_iteration takes more views a step"),
         ]
         check_ranges("", self, ranges)
         check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
         valid = port is None or 1 <= port <= 65535
         check_ranges("viewer.", self.viewer, [("websocket_port", valid, "in [1, 65535]")])
-        if self.load_step is not None and self.load_dir is None:
-            raise InputError(
-                f"load_step is {self.load_step}, but load_dir is not set: add --load-dir with the folder of a run."
-            )
         self._check_machine()
         self._check_rates()
         self.pipeline.check()
@@ -376,13 +372,13 @@ class SadgsTrainerConfig(TrainerConfig):
         """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive and finite."""
         for group, configs in self.optimizers.items():
             adam, rate, scheduler = configs["optimizer"], configs["optimizer"].lr, configs.get("scheduler")
-            # One launch updates all parameters.
-            if adam._target is not FusedAdam or adam.max_norm is not None or adam.weight_decay:
-                raise InputError(
-                    f"optimizers.{group}.optimizer must be sadgs's Adam without max_norm and weight_decay: leave out "
-                    "all but its lr."
-                )
-            check_ranges(f"optimizers.{group}.optimizer.", adam, [("lr", 0 <= rate <= 1, "in [0, 1]")])
+            ranges = [  # One launch updates all parameters.
+                ("_target", adam._target is FusedAdam, "sadgs's Adam"),
+                ("max_norm", adam.max_norm is None, "left out"),
+                ("weight_decay", not adam.weight_decay, "left out"),
+                ("lr", 0 <= rate <= 1, "in [0, 1]"),
+            ]
+            check_ranges(f"optimizers.{group}.optimizer.", adam, ranges)
             if isinstance(scheduler, RunLengthDecaySchedulerConfig):
                 factors = {name: getattr(scheduler, name) for name in ("initial_factor", "final_factor")}
                 allowed = f"positive, and {rate:g} times it at most 1"

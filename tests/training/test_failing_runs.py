@@ -135,7 +135,7 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig
             "pipeline.model.max_off_axis must be 0, or at least 1, the image's border, got 0.5.",
         ),
         ("pipeline.effort", math.nan, "pipeline.effort must be in (0, 100], got nan."),
-        ("load_step", 3, "load_step is 3, but load_dir is not set: add --load-dir with the folder of a run."),
+        ("load_step", 3, "load_step must be left out unless load_dir names a run, got 3."),
         ("optimizers.means.optimizer.lr", math.nan, "optimizers.means.optimizer.lr must be in [0, 1], got nan."),
         ("optimizers.quats.optimizer.lr", 1e9, "optimizers.quats.optimizer.lr must be in [0, 1], got 1e+09."),
         ("optimizers.scales.optimizer.lr", -1.0, "optimizers.scales.optimizer.lr must be in [0, 1], got -1."),
