@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from PIL import Image
 
@@ -18,6 +17,7 @@ tripod or a hand is."""
 
 def rotations() -> np.ndarray:
     """Return the rotations from a view's axes (x right, y down, z forward) to those of its panorama. [VIEWS, 3, 3]"""
+    import cv2  # Most photos need it not, and it takes time to import.
 
     def turn(pitch: float, yaw: float) -> np.ndarray:
         return cv2.Rodrigues(np.array([pitch, yaw, 0.0]))[0]
@@ -41,6 +41,8 @@ def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
 
 def cut(panorama: Image.Image) -> list[Image.Image]:
     """Cut a panorama into its `VIEWS`, squares of half its height."""
+    import cv2
+
     pixels, border = np.asarray(panorama), cv2.BORDER_WRAP
     maps = [map_of_view(i, panorama.height) for i in range(VIEWS)]
     return [Image.fromarray(cv2.remap(pixels, *places, cv2.INTER_CUBIC, borderMode=border)) for places in maps]

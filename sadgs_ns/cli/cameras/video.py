@@ -1,4 +1,7 @@
-"""Photos from videos: the sharpest frame of each stretch."""
+"""Photos from videos: the sharpest frame of each stretch.
+
+Functions import PyAV and OpenCV, which `sadgs` need not wait for where there is no video.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
-import av
-import cv2
 import numpy as np
-from av.error import InvalidDataError
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
@@ -18,6 +18,8 @@ from sadgs_ns.files import atomic_path
 
 def count_frames(video: Path) -> int:
     """Return the number of a video's frames, which recordings do not tell; raise InputError if it is no video."""
+    import av
+
     try:
         with av.open(os.fspath(video)) as container:
             stream = container.streams.best("video")
@@ -31,6 +33,9 @@ def count_frames(video: Path) -> int:
 
 def read_frames(video: Path) -> Iterator[np.ndarray]:
     """Yield the frames of a video as a player shows them: upright, and without damaged ones. BGR, uint8 [H, W, 3]"""
+    import av
+    from av.error import InvalidDataError
+
     with av.open(os.fspath(video)) as container:
         stream = container.streams.best("video")
         assert isinstance(stream, av.VideoStream)  # `count_frames` was called before.
@@ -49,6 +54,8 @@ def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, 
 
     The sharpest is the one whose Laplacian varies most.
     """
+    import cv2
+
     stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)
     for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
         grey = ((frame, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)) for _, frame in group)
@@ -79,6 +86,8 @@ def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tup
 
 def write_frames(frames: Iterable[tuple[str, np.ndarray]], folder: Path, report: Callable[[int], None]) -> None:
     """Write frames of `video_frames` to a folder as photos; raise WriteError if one cannot be written."""
+    import cv2
+
     for done, (name, frame) in enumerate(frames, 1):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(folder / name) as partial:
