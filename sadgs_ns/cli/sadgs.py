@@ -47,7 +47,7 @@ from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
-_TRAINING = "sadgs_ns.training.start:train"
+_TRAINING, _EXPORT = "sadgs_ns.training.start:train", "sadgs_ns.cli.exporting:export_all"
 _LOCK_SECONDS = 10.0
 """Time in which the last stage of a killed run may save."""
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
@@ -99,6 +99,7 @@ class PhotosToSplat:
         self._data = self.source if self._camera_file else self._scene
         self._settings: dict[str, Any] = {}
         self.timeline = Timeline()
+        self._exporter: Worker | None = None
         if not 0 < options.effort <= MOST_EFFORT:
             raise InputError(f"--effort must be in (0, {MOST_EFFORT}].")
         check_size(options.max_size)
@@ -300,6 +301,8 @@ class PhotosToSplat:
                 if fields["on_cpu"]:
                     line.print(_ON_CPU)
             elif event == "iteration":
+                # Meanwhile it imports what export needs.
+                self._exporter = self._exporter or self.worker("export", _EXPORT)
                 left = f", about {fields['left']} left" if fields["left"] else ""
                 line.update(f"iteration {fields['step']:,} of {total}{left}")
             elif event == "training ends":
@@ -321,23 +324,32 @@ class PhotosToSplat:
         return told
 
     def _export(self, line: StatusLine) -> str:
-        *others, last = self._formats
-        for name in others:
-            line.finish(self._export_as(name, line))
-        return self._export_as(last, line)
+        checkpoint, jobs, done = self._checkpoint(), [], []
+        for name in self._formats:
+            output = self.folder / f"splat.{name}"
+            if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
+                done.append(f"{output}; done before")
+            else:  # The folder may have been renamed since the run's config.yml noted where the scene is.
+                jobs.append(Export(self._run, output, data=self._data))
+        written: list[Path] = []
 
-    def _export_as(self, name: str, line: StatusLine) -> str:
-        output, checkpoint = self.folder / f"splat.{name}", self._checkpoint()
-        if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
-            return f"{output}; done before"
-        line.update(str(output))
-        self.timeline.begin("export", name)
-        worker = self.worker("export", "sadgs_ns.cli.export:export")
-        # The folder may have been renamed since the run's config.yml noted where the scene is.
-        options = Export(self._run, output, data=self._data)
-        command = ["sadgs-export", str(self._run), "--output", str(output), "--data", str(self._data)]
-        self.call(worker, line, lambda event, **fields: None, command, options)
-        return f"{output}, {output.stat().st_size / 1e6:,.1f} MB"
+        def told() -> str:
+            return f"{written[-1]}, {written[-1].stat().st_size / 1e6:,.1f} MB"
+
+        def on_event(event: str, **fields: Any) -> None:
+            if event == "export begins":
+                for sentence in done if not written else [told()]:
+                    line.finish(sentence)
+                written.append(Path(fields["output"]))
+                line.update(str(written[-1]))
+                self.timeline.begin("export", written[-1].name.removeprefix("splat."))
+
+        if jobs:
+            self.call(self._exporter or self.worker("export", _EXPORT), line, on_event, [], jobs)
+            return told()
+        for sentence in done[:-1]:
+            line.finish(sentence)
+        return done[-1]
 
 
 STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {

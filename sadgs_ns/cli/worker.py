@@ -173,7 +173,8 @@ def main() -> None:
     try:
         function = pkgutil.resolve_name(sys.argv[1])
         with os.fdopen(channel, "rb", closefd=False) as given, suppress(EOFError):
-            sys.argv, arguments = pickle.load(given)
+            command, arguments = pickle.load(given)
+            sys.argv = command or sys.argv
             threading.Thread(target=_end_with_parent, args=(channel,), daemon=True).start()
             events.report("result", value=function(*arguments))
     except KeyboardInterrupt:

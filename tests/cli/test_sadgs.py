@@ -341,23 +341,43 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The commands of the stages of `sadgs`, which are not run, but for a checkpoint and a splat of 0 bytes."""
     called: list[list[str]] = []
 
-    def call(
-        work: PhotosToSplat, worker: object, line: object, on_event: object, command: list[str], *others: Any
-    ) -> Any:
+    def call(work: PhotosToSplat, worker: object, line: object, on_event: Any, command: list[str], *others: Any) -> Any:
+        if not command:
+            (jobs,) = others
+            for job in jobs:
+                called.append(["sadgs-export", "--data", str(job.data)])
+                job.output.touch()
+                on_event("export begins", output=str(job.output))
+            return
         called.append(command)
         if command[0] == "sadgs-process":
             Path(command[2]).mkdir()
             (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
-        if command[0] == "ns-train":
-            (work._run / "nerfstudio_models").mkdir(parents=True)
-            (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()
-        else:
-            Path(command[command.index("--output") + 1]).touch()
+        on_event("training begins", iterations=8, on_cpu=False)
+        on_event("iteration", step=7, left="")
+        (work._run / "nerfstudio_models").mkdir(parents=True)
+        (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()
 
     monkeypatch.setattr(PhotosToSplat, "call", call)
     monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
     return called
+
+
+def test_the_process_that_exports_starts_while_training_runs(
+    scene: Path, tmp_path: Path, commands: list[list[str]], monkeypatch: pytest.MonkeyPatch
+):
+    started: list[tuple[str, list[str]]] = []
+
+    def worker(work: PhotosToSplat, stage: str, function: str) -> object:
+        started.append((stage, [words[0] for words in commands]))
+        return object()
+
+    monkeypatch.setattr(PhotosToSplat, "worker", worker)
+    make_a_page_without_network(tmp_path / "npx", monkeypatch)
+    assert main([str(scene), "-o", str(tmp_path / "out"), "--formats", "html,ply"]) == 0
+    assert started == [("training", []), ("export", ["ns-train"])], "one process makes both files"
+    assert [words[0] for words in commands] == ["ns-train", "sadgs-export", "sadgs-export"]
 
 
 @pytest.mark.hard_case(

@@ -1,0 +1,25 @@
+"""The export of `sadgs`: all formats in one process, which imports what they need while training runs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+
+from sadgs_ns.cli.export import Export, export
+from sadgs_ns.events import report
+from sadgs_ns.training.deferred_imports import import_nerfstudio
+
+import_nerfstudio()  # It precedes what imports nerfstudio. `export` itself imports these when it is called.
+
+from sadgs_ns.data import parsers, run_cameras  # noqa: E402, F401
+from sadgs_ns.method import cleaning  # noqa: E402, F401
+from sadgs_ns.training import checkpoints  # noqa: E402, F401
+
+
+def export_all(jobs: Sequence[Export]) -> None:
+    """Export as `export` does, print the command that would, and report each file before it is made."""
+    for job in jobs:
+        command = ["sadgs-export", str(job.run), "--output", str(job.output), "--data", str(job.data)]
+        print(f"$ {shlex.join(command)}")
+        report("export begins", output=str(job.output))
+        export(job)
