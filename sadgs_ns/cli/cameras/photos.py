@@ -128,12 +128,13 @@ def _read_photo(folder: Path, name: str) -> Photo:
         is_known = is_known and latitude[0] <= 90 and longitude[0] <= 180
         position = latitude + longitude + altitude if is_known else ()
         camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
-        kinds = image.has_transparency_data, image.format in COLMAP_FORMATS, orientation in NOT_UPRIGHT
+        has_alpha, is_read = image.has_transparency_data, image.format in COLMAP_FORMATS
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         least = 512 if width == 2 * height else 0
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
         image.load()
-        return Photo(name, size, camera, position, *kinds, is_panorama(image, size))
+        is_turned = orientation in NOT_UPRIGHT
+        return Photo(name, size, camera, position, has_alpha, is_read, is_turned, is_panorama(image, size))
 
 
 def _numbers(value: Any) -> tuple[float, ...]:

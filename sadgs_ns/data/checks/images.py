@@ -111,30 +111,33 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     for same in problems.values():
         path, text = same[0]
         yield fault(f"{and_more(path, len(same))} {text}.")
-    if not problems and all(_is_flat(frame.image) for frame in frames):
+    if look_for_unused and (unused := _unused_images(frames)):
+        where = and_more(unused[0], len(unused))
+        yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
+    if problems:
+        return
+    if all(_is_flat(frame.image) for frame in frames):
         yield fault(
             f"{source} has {len(frames)} images that show a single colour and nothing else, such as {frames[0].image}: "
             "export them again."
         )
-    if not problems and all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
+    if all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
         yield fault(
             f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
             "train on: make white what is to be trained on."
         )
-    # Of square or mirrored images the size does not tell whether the poses are of the turned ones.
-    unclear = [image.orientation in (NOT_UPRIGHT if len({*image.size}) == 1 else range(2, 5)) for image in images]
-    pairs = zip(frames, images, unclear, strict=True)
-    lying = [frame.image for frame, image, is_unclear in pairs if is_unclear and image.format != "TIFF"]
-    if lying and not problems:
+    lying = [frame.image for frame, image in zip(frames, images, strict=True) if _may_lie(image)]
+    if lying:
         yield warning(
             f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
             f"COLMAP does: if the poses are those of the turned images, {_TURN}."
         )
-    if look_for_unused and (unused := _unused_images(frames)):
-        where = and_more(unused[0], len(unused))
-        yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
-    if not problems:
-        yield note(_describe(source, images, masks))
+    yield note(_describe(source, images, masks))
+
+
+def _may_lie(image: _Image) -> bool:
+    """Return whether EXIF would turn or mirror an image without a change of its size, which the pose could be of."""
+    return image.format != "TIFF" and image.orientation in (NOT_UPRIGHT if len({*image.size}) == 1 else range(2, 5))
 
 
 def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> tuple[str, Path, str] | None:
@@ -184,7 +187,6 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
 
 
 def _unused_images(frames: Sequence[Frame]) -> list[Path]:
-    """Return the images beside the frames' that no frame uses."""
     # Unlike Path.resolve, realpath does not raise where links form a loop.
     used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
     folders = sorted({frame.image.parent for frame in frames})

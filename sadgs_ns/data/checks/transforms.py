@@ -73,7 +73,6 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
 
 
 def _no_transforms(data: Path, path: Path) -> str:
-    """Return the sentence for data without a `transforms.json`."""
     if (found := find_reconstruction(data)) is not None:
         problem = f"{path} does not exist, but {data / found} holds a COLMAP reconstruction"
         return f"{problem}: leave `nerfstudio-data` out of the command."
