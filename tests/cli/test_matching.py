@@ -53,6 +53,28 @@ def test_matches_are_those_of_a_loop_over_all_pairs(matching: ModuleType, number
     assert len(found) >= shared - 1
 
 
+def test_photos_are_paired_with_those_that_look_most_alike(matching: ModuleType):
+    """Of a ring of photos, each of which shares features with the next ones, and of another that shares none."""
+    generator = np.random.default_rng(0)
+    scene = random_descriptors(12 * 20, generator)
+    ring = [scene[(20 * i + np.arange(60)) % len(scene)] for i in range(12)]
+    photos = [*ring, random_descriptors(60, generator), scene[:0]]
+    pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 4)
+    near = {(i, j) for i in range(12) for j in range(i + 1, 12) if min(j - i, 12 + i - j) <= 2}
+    assert near <= {*pairs} and len(pairs) == len({*pairs}) <= 4 * len(photos)
+    assert all(i < j for i, j in pairs)
+
+
+def test_groups_of_photos_that_hardly_look_alike_are_joined(matching: ModuleType):
+    generator = np.random.default_rng(0)
+    one, other = random_descriptors(40, generator), random_descriptors(40, generator)
+    photos = [one] * 4 + [other] * 4
+    photos[2], photos[5] = np.r_[one, other[:1]], np.r_[other, other[:1]]
+    pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 3)
+    assert any(i < 4 <= j for i, j in pairs)
+    assert matching.similar_pairs([torch.zeros(0, 128, dtype=torch.uint8)] * 3, 1)  # as of photos without texture
+
+
 def parts_of_a_wall(folder: Path) -> list[str]:
     """Write three overlapping photos of a blotchy wall; returns their names."""
     wall = gaussian_filter(np.random.default_rng(0).normal(size=(400, 700)), 2.5)

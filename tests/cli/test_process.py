@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import functools
 import itertools
 import json
 import os
@@ -45,7 +44,7 @@ from sadgs_ns.cli.cameras.command import Process, main, photos_added, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
 from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, pairs_to_match
-from sadgs_ns.cli.cameras.reconstruct import check_written, fetch_vocabulary, match, sequential_pairs
+from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
@@ -608,69 +607,21 @@ def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: 
     assert "9.png 10.png\n" in (tmp_path / "pairs.txt").read_text()
 
 
-def no_vocabulary() -> None:
-    raise RunError("COLMAP failed.")
-
-
-@pytest.mark.hard_case("a vocabulary tree that is there", "is found")
-def test_a_vocabulary_tree_that_is_there_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The tree is a small one of random descriptors, because COLMAP's own has to be downloaded."""
-    random, kind = np.random.default_rng(0), pycolmap.FeatureExtractorType.SIFT
-    tree = pycolmap.VisualIndex.create(128, 64)
-    descriptors = pycolmap.FeatureDescriptorsFloat(type=kind, data=random.random((2600, 128), np.float32))
-    options = pycolmap.VisualIndex.BuildOptions()
-    options.num_visual_words = 64
-    tree.build(options, descriptors)
-    tree.write(tmp_path / "tree")
-    pairing = pycolmap.VocabTreePairingOptions(vocab_tree_path=tmp_path / "tree")
-    matching = functools.partial(pycolmap.match_vocabtree, pairing_options=pairing)
-    monkeypatch.setattr(pycolmap, "match_vocabtree", matching)
-    steps: list[tuple] = []
-    monkeypatch.setattr(reconstruct, "progress", lambda *step: steps.append(step))
-    fetch_vocabulary(tmp_path)
-    assert steps == [("vocabulary tree", 0, 1), ("vocabulary tree", 1, 1)]
-
-
-def numbered(count: int, has_position: bool = False, name: str = "IMG_{}.jpg") -> list[Photo]:
-    return [Photo(name.format(i), (8, 8), (), (48.0, 11.0, float(i)) * has_position, False) for i in range(count)]
-
-
 @pytest.mark.hard_case(
-    "more than 200 photos without a network for the vocabulary tree",
-    "known before any work (a probe of COLMAP's own download); numbered photos are matched in their order, "
-    "others exhaustively, with a sentence that says so",
+    "many photos, in any order and without a network", "each is matched with those that look most alike"
 )
 @pytest.mark.parametrize(
-    ("asked", "photos", "is_video", "chosen", "told"),
+    ("asked", "photos", "is_video", "chosen"),
     [
-        ("auto", numbered(EXHAUSTIVE_LIMIT), False, "exhaustive", ""),
-        ("auto", numbered(EXHAUSTIVE_LIMIT + 1), True, "sequential", ""),
-        ("auto", numbered(EXHAUSTIVE_LIMIT + 1, has_position=True), False, "spatial", ""),
-        (
-            "auto",
-            numbered(300),
-            False,
-            "sequential",
-            "each is matched with those that follow it (--matching sequential)",
-        ),
-        (
-            "auto",
-            [*numbered(300), *numbered(1, name="x{}.jpg")],
-            False,
-            "exhaustive",
-            "which takes long; --matching sequential",
-        ),
-        ("exhaustive", numbered(300), False, "exhaustive", ""),
-        ("spatial", numbered(3, has_position=True), False, "spatial", ""),
+        ("auto", EXHAUSTIVE_LIMIT, False, "exhaustive"),
+        ("auto", EXHAUSTIVE_LIMIT + 1, False, "similar"),
+        ("auto", EXHAUSTIVE_LIMIT + 1, True, "sequential"),
+        ("exhaustive", 300, False, "exhaustive"),
+        ("similar", 3, False, "similar"),
     ],
 )
-def test_without_a_vocabulary_photos_are_matched_in_another_way(
-    asked: Matching, photos: list[Photo], is_video: bool, chosen: str, told: str
-):
-    matching, notice = choose_matching(asked, photos, is_video, no_vocabulary)
-    assert matching == chosen and told in notice and bool(told) == bool(notice)
-    if notice:
-        assert choose_matching(asked, photos, is_video, lambda: None) == ("vocabulary", "")
+def test_pairs_of_photos_are_chosen_by_their_number(asked: Matching, photos: int, is_video: bool, chosen: str):
+    assert choose_matching(asked, photos, is_video) == chosen
 
 
 @pytest.mark.hard_case(
@@ -684,54 +635,8 @@ def test_the_pairs_to_match_are_counted():
 
 
 @pytest.mark.hard_case(
-    "`--matching vocabulary` without a network; `--matching spatial` without GPS positions",
-    "refused before any work: use sequential or exhaustive; how many have no position, and one of them",
-)
-def test_a_way_of_matching_that_cannot_work_is_told_before_any_work(photos: Path, tmp_path: Path, monkeypatch, capsys):
-    command = [str(photos), str(tmp_path / "out"), "--matching"]
-    assert main([*command, "spatial"]) == 2
-    told = "every photo, and 11 of the 11 have none, such as 00.png; use sequential, exhaustive or auto."
-    assert told in capsys.readouterr().err
-    monkeypatch.setattr(program, "run_colmap", lambda *arguments, **others: no_vocabulary())
-    assert main([*command, "vocabulary"]) == 2
-    assert (
-        "Use --matching sequential for photos in the order of their taking, or exhaustive." in capsys.readouterr().err
-    )
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.hard_case("GPS positions without altitude, which COLMAP does not use", "count as none, before any work")
-def test_photos_with_gps_positions_are_known(tmp_path: Path):
-    for i in range(3):
-        exif = Image.Exif()
-        exif[0x8825] = {1: "N", 2: (48.0, 5.0, float(i)), 3: "E", 4: (11.0, 0.0, 0.0)} | ({6: 500.0} if i < 2 else {})
-        Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
-    read = read_photos(tmp_path, [f"{i}.jpg" for i in range(3)], lambda *step: None)
-    assert [bool(photo.position) for photo in read] == [True, True, False]
-
-
-@pytest.mark.hard_case(
-    "GPS positions of 0°, 0°, beyond 90°, without degrees, of 0/0, or one position for all photos, as phones repeat "
-    "indoors",
-    "count as none, and do not decide which photos are matched",
-)
-def test_positions_that_tell_nothing_are_not_matched_by(tmp_path: Path):
-    unknown, nothing = IFDRational(0, 0), (0.0, 0.0, 0.0)
-    latitudes = [nothing, (95.0, 0.0, 0.0), (), (48.0, unknown, 0.0), (48.0, 5.0, 0.0)]
-    for i, latitude in enumerate(latitudes):
-        exif = Image.Exif()
-        exif[0x8825] = {1: "N", 2: latitude, 3: "E", 4: (11.0, 0.0, 0.0) if i else nothing, 6: 500.0}
-        Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
-    read = read_photos(tmp_path, [f"{i}.jpg" for i in range(len(latitudes))], lambda *step: None)
-    assert [photo.position for photo in read] == [(), (), (), (), (48.0, 5.0, 0.0, 11.0, 0.0, 0.0, 500.0)]
-    same = [dataclasses.replace(photo, position=(48.0, 11.0, 0.0)) for photo in numbered(EXHAUSTIVE_LIMIT + 1)]
-    assert choose_matching("auto", same, False, lambda: None)[0] == "vocabulary"
-    assert choose_matching("spatial", same, False, lambda: None)[0] == "spatial"
-
-
-@pytest.mark.hard_case(
     "EXIF with a focal length or a GPS position of 0/0, and without one",
-    "count as unknown: the photos are of one camera, and have no position",
+    "count as unknown: the photos are of one camera",
 )
 @pytest.mark.parametrize("focal", [IFDRational(0, 0), IFDRational(5, 0), IFDRational(0, 1), None])
 def test_a_focal_length_that_is_no_number_is_none(focal: Any, tmp_path: Path):
@@ -743,7 +648,7 @@ def test_a_focal_length_that_is_no_number_is_none(focal: Any, tmp_path: Path):
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     names = [f"{i}.jpg" for i in range(3)]
     read = read_photos(tmp_path, names, lambda *step: None)
-    assert photos_by_camera(read) == [names] and not any(photo.position for photo in read)
+    assert photos_by_camera(read) == [names]
 
 
 @pytest.mark.hard_case(
@@ -784,13 +689,15 @@ def test_digital_zoom_is_another_camera(tmp_path: Path):
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
-    """Its vocabulary tree is not asked for here, because this database cannot be made."""
+    """The folder of its database does not exist."""
     steps: list[str] = []
-    with pytest.raises(RunError, match=r"^COLMAP failed while it worked on vocabulary tree \(.+\); run the same com"):
+    model = tmp_path / "none" / "model"
+    with pytest.raises(RunError, match=r"^COLMAP failed while it worked on features \(.+\); run the same com"):
         run_colmap(
-            "fetch_vocabulary", tmp_path / "none", folder=tmp_path, report=lambda stage, *others: steps.append(stage)
-        )
-    assert steps == ["vocabulary tree"] and not list(tmp_path.iterdir())
+            "make_model", tmp_path, [["a.png"]], "exhaustive", 0, model, None, [],
+            folder=tmp_path, report=lambda stage, *others: steps.append(stage),
+        )  # fmt: skip
+    assert steps == ["features"] and not list(tmp_path.iterdir())
 
 
 @pytest.mark.hard_case(

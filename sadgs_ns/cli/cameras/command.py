@@ -14,7 +14,6 @@ import os
 import shlex
 import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -175,10 +174,6 @@ def process(options: Process) -> Summary:
 def _make(scene: _Scene, report: Report) -> Summary:
     options, work = scene.options, scene.work
 
-    def fetch_vocabulary() -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            run_colmap("fetch_vocabulary", Path(scratch), folder=Path(scratch), report=report)
-
     with contextlib.ExitStack() as alone:
         folder, names = options.source, scene.settings["photos"]
         if scene.is_video:
@@ -196,12 +191,12 @@ def _make(scene: _Scene, report: Report) -> Summary:
         if scene.is_video:
             photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
         views = [view for photo in photos for view in photo.views]
-        matching, notice = choose_matching(options.matching, views, options.source.is_file(), fetch_vocabulary)
+        matching = choose_matching(options.matching, len(views), options.source.is_file())
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
             scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
             alone.enter_context(scene.alone())  # Only now, when the photos are known to be readable.
-        _tell_work(scene, photos, matching, notice)
+        _tell_work(scene, photos, matching)
         if scene.added:  # An interrupted run may have made these without some of them.
             for path in (scene.model, work / "photos"):
                 shutil.rmtree(path, ignore_errors=True)
@@ -220,7 +215,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
     return summary
 
 
-def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notice: str) -> None:
+def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching) -> None:
     before = {*scene.begun["photos"]} if scene.added else set()
     if scene.added:
         added = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
@@ -235,7 +230,7 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching, notic
     views = sum(len(photo.views) for photo in photos)
     known = sum(len(photo.views) for photo in photos if photo.name in before)
     pairs = pairs_to_match(views, matching, known)
-    _say("planned", f"{notice} {views - known} photos, up to {pairs:,} pairs to match.".lstrip())
+    _say("planned", f"{views - known} photos, up to {pairs:,} pairs to match.")
 
 
 def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:

@@ -122,7 +122,11 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 
 
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
-    """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
+    """Return how many photos of these sizes in px are searched at a time: one on most cores if memory allows.
+
+    Of 16 cores two are left for the import of torch, which goes on meanwhile.
+    """
     pixels = max(map(searched_pixels, sizes), default=1.0)
     at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
-    return max(1, int(min(os.cpu_count() or 1, at_a_time)))
+    cores = os.cpu_count() or 1
+    return max(1, int(min(cores - cores // 8, at_a_time)))

@@ -27,7 +27,6 @@ _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 """Suffixes that tell COLMAP in which format to write; it reads by what a file holds."""
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
 """The second alone tells of a phone's digital zoom."""
-_POSITION = (ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSAltitude)
 _NAMED = 20  # How many unreadable photos a message names
 
 
@@ -38,8 +37,6 @@ class Photo:
     name: str  # Relative to the folder of the photos
     size: tuple[int, int]  # Width and height in px, upright
     camera: tuple  # Equal for photos by one camera at one focal length, as far as size and EXIF tell
-    position: tuple[float, ...]
-    """Latitude, longitude and altitude as EXIF holds them; empty if one lacks, because COLMAP then uses none."""
     has_alpha: bool  # Whether some pixels may be transparent
     is_read: bool = True  # Whether COLMAP reads its format
     is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
@@ -50,7 +47,7 @@ class Photo:
         """The views that a panorama is cut into, without a camera of their own; another photo is its own view."""
         suffix, size = "png" if self.has_alpha else "jpg", (self.size[1] // 2, self.size[1] // 2)
         names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
-        return [Photo(name, size, (), (), self.has_alpha) for name in names] if self.is_panorama else [self]
+        return [Photo(name, size, (), self.has_alpha) for name in names] if self.is_panorama else [self]
 
 
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
@@ -121,12 +118,8 @@ def _read_photo(folder: Path, name: str) -> Photo:
         orientation = exif.get(ExifTags.Base.Orientation)
         width, height = image.size
         size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
-        lens, gps = (exif.get_ifd(part) for part in (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))
+        lens = exif.get_ifd(ExifTags.IFD.Exif)
         focals = [max((0.0, *_numbers(lens.get(tag)))) for tag in _FOCAL_LENGTHS]  # mm; 0 is unknown, too
-        latitude, longitude, altitude = (_numbers(gps.get(tag)) for tag in _POSITION)
-        is_known = latitude and longitude and altitude and any(latitude + longitude)  # 0, 0 is what has no position.
-        is_known = is_known and latitude[0] <= 90 and longitude[0] <= 180
-        position = latitude + longitude + altitude if is_known else ()
         camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
         has_alpha, is_read = image.has_transparency_data, image.format in COLMAP_FORMATS
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
@@ -134,7 +127,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
         image.load()
         is_turned = orientation in NOT_UPRIGHT
-        return Photo(name, size, camera, position, has_alpha, is_read, is_turned, is_panorama(image, size))
+        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_panorama(image, size))
 
 
 def _numbers(value: Any) -> tuple[float, ...]:

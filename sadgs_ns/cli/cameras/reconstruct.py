@@ -13,6 +13,7 @@ import json
 import shutil
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,15 +39,14 @@ _PAIRS, _PAIRS_ON_GPU = 50, 400
 """Pairs of photos that are matched, saved and reported together; for each lot COLMAP starts its threads anew, and the
 descriptors travel to the GPU."""
 _ADJUSTMENT = {
-    "ba_global_frames_ratio": 2.0, "ba_global_points_ratio": 2.0,
+    "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
     "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
+    "ba_local_max_refinements": 1, "ba_global_max_refinements": 1,
 }  # fmt: skip
-"""Growth of a model until all of it is adjusted again, and the relative change of the cost at which an adjustment
-ends. COLMAP's own are 1.1 and 0 (docs/results.md#finding-cameras)."""
+"""Growth of a model until all of it is adjusted again, the relative change of the cost at which an adjustment ends, and
+how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5 (docs/results.md#finding-cameras)."""
 _ADJUSTED_PHOTOS = 2
-"""Photos that are adjusted after each that is placed; COLMAP's own are 6. With these numbers placing cameras takes .32
-to .41 of the time that it takes with COLMAP's on three captures, .74 to .81 if photos are added to a model, and moves
-them by at most .3 %."""
+"""Photos that are adjusted after each that is placed; COLMAP's own are 6."""
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
@@ -77,19 +77,17 @@ def make_model(
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
-    if not model.exists():
-        with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds.
-            gpu = pool.submit(wake_gpu)
+    with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds, as that of nerfstudio.
+        gpu, nerfstudio = pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
+        if not model.exists():
             extract(photos, groups, database, rigs)
-        match(names, database, matching, gpu.result(), rigs)
-        place_cameras(photos, names, database, model, base)
-    known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
-    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
-    undistort(photos, model, made, max_size, known)
-    from nerfstudio.process_data.colmap_utils import colmap_to_json  # It imports torch.
-
+            match(names, database, matching, gpu.result(), rigs)
+            place_cameras(photos, names, database, model, base)
+        known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
+        made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+        undistort(photos, model, made, max_size, known)
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
-        colmap_to_json(undistorted / "sparse" / "0", undistorted)
+        nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
     return summarize(names, made, database, matching, (model / "attempts.txt").read_text())
@@ -102,27 +100,9 @@ def wake_gpu() -> torch.device | None:
     if not torch.cuda.is_available():
         return None
     device = torch.device("cuda")
-    torch.zeros(1, device=device)  # The first tensor on a device starts it.
+    torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first ones on a device start it.
+    import_module("sadgs_ns.cli.cameras.matching")
     return device
-
-
-def fetch_vocabulary(folder: Path) -> None:
-    """Match two made-up photos in an empty folder: COLMAP downloads its vocabulary tree, or aborts the process."""
-    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    progress("vocabulary tree", 0, 1)
-    database = folder / "database.db"
-    random = np.random.default_rng(0)
-    with pycolmap.Database.open(database) as opened:
-        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=100, height=100, params=[100, 50, 50])
-        camera_id = opened.write_camera(camera)
-        for name in "ab":
-            image_id = opened.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-            opened.write_keypoints(image_id, random.uniform(0, 100, (50, 2)).astype(np.float32))
-            kind = pycolmap.FeatureExtractorType.SIFT
-            descriptors = random.integers(0, 256, (50, 128), dtype=np.uint8)
-            opened.write_descriptors(image_id, pycolmap.FeatureDescriptors(type=kind, data=descriptors))
-    pycolmap.match_vocabtree(database)
-    progress("vocabulary tree", 1, 1)
 
 
 def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
@@ -177,17 +157,23 @@ def match(
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
     # COLMAP separates the names in a list of pairs by spaces.
-    listable = not any(character.isspace() for name in names for character in name)
-    if matching in ("spatial", "vocabulary") or not listable:  # These functions do not report their progress.
-        progress(stage, 0, 1)
-        function = getattr(pycolmap, "match_vocabtree" if matching == "vocabulary" else f"match_{matching}")
+    if any(character.isspace() for name in names for character in name):
+        progress(stage, 0, 1)  # These functions do not report their progress.
+        function = pycolmap.match_sequential if matching == "sequential" else pycolmap.match_exhaustive
         function(database, verification_options=verification)
         progress(stage, 1, 1)
         return
-    pairs = choose_pairs(names, rigs, matching)
-    progress(stage, 0, len(pairs))
+    progress(stage, 0, 1)
+    if matching == "similar":
+        from sadgs_ns.cli.cameras.matching import similar_photos
+
+        panorama = {view: views[0] for views in rigs for view in views}
+        pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
+    else:
+        pairs = choose_pairs(names, rigs, matching)
     at_once = _PAIRS_ON_GPU if gpu is not None else _PAIRS
     for start in range(0, len(pairs), at_once):
+        progress(stage, start, len(pairs))
         chunk = pairs[start : start + at_once]
         if gpu is not None:
             from sadgs_ns.cli.cameras.matching import write_matches
@@ -196,7 +182,7 @@ def match(
         pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
         pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-        progress(stage, start + len(chunk), len(pairs))
+    progress(stage, len(pairs), len(pairs))
 
 
 def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
