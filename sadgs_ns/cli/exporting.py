@@ -5,11 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
+import scipy.cluster.vq  # noqa: F401 - for pages; `export` itself imports it, and what is below, when it is called
+
 from sadgs_ns.cli.export import Export, export
 from sadgs_ns.events import report
 from sadgs_ns.training.deferred_imports import import_nerfstudio
 
-import_nerfstudio()  # It precedes what imports nerfstudio. `export` itself imports these when it is called.
+import_nerfstudio()  # It precedes what imports nerfstudio.
 
 from sadgs_ns.data import parsers, run_cameras  # noqa: E402, F401
 from sadgs_ns.method import cleaning  # noqa: E402, F401
