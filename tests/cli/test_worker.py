@@ -106,6 +106,20 @@ def test_a_worker_has_imported_before_its_arguments_come(program, tmp_path: Path
     assert log.read_text("utf8").count("ran with") == 1
 
 
+def test_a_worker_ends_when_its_threads_and_what_is_due_at_its_exit_are_done(program):
+    log = program(
+        "import atexit, threading, time\n"
+        "def write(): time.sleep(0.5); print('written', end=' ')\n"
+        "def function():\n"
+        "    atexit.register(print, 'exit')\n"
+        "    threading.Thread(target=write).start()\n"
+        "    return 3\n"
+    )
+    with Worker("program:function", log, saves=True) as worker:
+        assert worker.run(on_event=print) == 3
+        assert log.read_text("utf8") == "written exit\n"
+
+
 def test_a_worker_whose_import_failed_tells_why(program):
     log = program("raise SystemExit('error: Without numpy nothing works.')")
     with pytest.raises(WorkerError, match=r"^Without numpy nothing works$"):
