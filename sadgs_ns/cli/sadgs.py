@@ -312,7 +312,8 @@ class PhotosToSplat:
         line.update("going on" if begun else "starting")
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
-        command += ["--timestamp", self._run.name, "--vis", "none"]
+        measures = "--steps-per-eval" in " ".join(self.train_options).replace("_", "-")  # for which there is a logger
+        command += ["--timestamp", self._run.name, "--vis", "tensorboard" if measures else "none"]
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
         worker = self._trainer or self.worker("training", _TRAINING)

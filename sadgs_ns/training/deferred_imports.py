@@ -1,8 +1,7 @@
 """Modules that nerfstudio imports at its start, and that a run of `sadgs` never uses.
 
-They take more than half of the time of nerfstudio's import. While one of nerfstudio's modules is imported, each that it
-need not have is a stand-in, which imports the true module when something asks for it. Nothing of nerfstudio changes on
-disk, and whoever imports these modules later gets them as ever.
+They take over half of its time. While a module of nerfstudio is imported, each that it need not have is a stand-in,
+which imports the true module when something asks for it. Whoever imports that later gets the true one.
 """
 
 from __future__ import annotations

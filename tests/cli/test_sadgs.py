@@ -364,6 +364,14 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     return called
 
 
+def test_there_is_a_logger_where_held_out_views_are_measured(scene: Path, tmp_path: Path, commands: list[list[str]]):
+    for number, (options, logger) in enumerate((([], "none"), (["--steps_per_eval_image", "5"], "tensorboard"))):
+        output = str(tmp_path / str(number))
+        assert main([str(scene), "-o", output, "--formats", "ply", "--", *options]) == 0
+        command = commands[-2]
+        assert command[command.index("--vis") + 1] == logger
+
+
 def test_the_process_that_exports_starts_while_training_runs(
     scene: Path, tmp_path: Path, commands: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ):
