@@ -18,6 +18,7 @@ from scenes import HEIGHT, POINTS, WIDTH
 from examples.drawn_scene.scene import room_surfaces
 from sadgs_ns.data.parsers import points_in_the_run
 from sadgs_ns.errors import InputError
+from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import datamanager, model, pipeline, presets, stereo_start
 
@@ -69,6 +70,21 @@ def test_few_views_start_from_stereo_depth_or_a_line_says_why_not(config: Any, m
         check(fewest <= TRAIN_VIEWS <= most)
     config.pipeline.datamanager.dataparser = nerfstudio_data(config.output_dir / "data")
     check(False)
+
+
+def test_of_many_views_some_are_taken_that_lie_evenly(config: Any, monkeypatch: pytest.MonkeyPatch):
+    counts: list[int] = []
+
+    def counted(images: Any, viewmats: torch.Tensor, Ks: torch.Tensor, *others: Any, **options: Any) -> Any:
+        counts.append(len(viewmats))
+        assert len(Ks) == len(options["masks"]) == len(viewmats)
+        return depth_maps(images, viewmats, Ks, *others, **options)
+
+    monkeypatch.setattr(stereo_start, "depth_maps", counted)
+    everything = set_up(config).pipeline.model.num_points
+    monkeypatch.setattr(stereo_start, "MOST_VIEWS", TRAIN_VIEWS - 2)
+    assert POINTS + 100 < set_up(config).pipeline.model.num_points <= everything
+    assert counts == [TRAIN_VIEWS, TRAIN_VIEWS - 2]
 
 
 @pytest.mark.parametrize("cap", [POINTS - 100, POINTS, POINTS + 50])
