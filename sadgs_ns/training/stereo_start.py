@@ -46,18 +46,22 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     cached = pipeline.datamanager.cached_train  # Undistorting images changes cameras.
     # Of a video's frames, neighbours far apart tell more about depth.
     chosen = torch.linspace(0, len(cached) - 1, min(len(cached), MOST_VIEWS)).round().long()
-    data, cameras = [cached[i] for i in chosen], pipeline.datamanager.train_dataset.cameras[chosen]
+    cameras, views = pipeline.datamanager.train_dataset.cameras[chosen], chosen.tolist()
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
     assert model.seed_points is not None
     points, Ks = model.seed_points[0], cameras.get_intrinsics_matrices()
     points = points[plausible_points(points)].to(model.device)
-    masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in data]
-    depths = depth_maps(lambda view: data[view]["image"], viewmats, Ks, points, masks=masks, device=model.device)
-    photos, wavelengths = (
-        lambda i: cache.photo(data[i])[..., :3],
-        lambda i: wavelength(dequantize(cache[int(chosen[i])])),
+    # Images that stay compressed are decoded at each access: the host may have no room for all of them.
+    masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in (cached[view] for view in views)]
+    depths = depth_maps(lambda i: cached[views[i]]["image"], viewmats, Ks, points, masks=masks, device=model.device)
+    starts = dense_points(
+        depths,
+        viewmats,
+        lambda i: cache.photo(cached[views[i]])[..., :3],
+        lambda i: wavelength(dequantize(cache[views[i]])),
+        number,
     )
-    added = model.add_points(*dense_points(depths, viewmats, photos, wavelengths, number))
+    added = model.add_points(*starts)
     known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)
     note(f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points.")
     return True

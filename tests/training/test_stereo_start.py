@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import datamanager, model, pipeline, presets, stereo_start
+from sadgs_ns.training.images import LazyImages
 
 
 @pytest.fixture
@@ -85,6 +87,23 @@ def test_of_many_views_some_are_taken_that_lie_evenly(config: Any, monkeypatch: 
     monkeypatch.setattr(stereo_start, "MOST_VIEWS", TRAIN_VIEWS - 2)
     assert POINTS + 100 < set_up(config).pipeline.model.num_points <= everything
     assert counts == [TRAIN_VIEWS, TRAIN_VIEWS - 2]
+
+
+def test_images_that_stay_compressed_are_decoded_one_by_one(config: Any, monkeypatch: pytest.MonkeyPatch):
+    decoded: list[weakref.ref[torch.Tensor]] = []
+    alive: list[int] = []
+    decode = LazyImages.__getitem__
+
+    def counted(images: LazyImages, index: Any) -> Any:
+        data = decode(images, index)
+        decoded.append(weakref.ref(data["image"]))
+        alive.append(sum(image() is not None for image in decoded))
+        return data
+
+    config.pipeline.datamanager.cache_images = "compressed"
+    monkeypatch.setattr(LazyImages, "__getitem__", counted)
+    set_up(config)
+    assert len(alive) >= TRAIN_VIEWS and max(alive) < TRAIN_VIEWS / 2
 
 
 @pytest.mark.parametrize("cap", [POINTS - 100, POINTS, POINTS + 50])
