@@ -33,8 +33,6 @@ def update_param_with_optimizer(
 ) -> None:
     """Replace parameters and their optimizers' moments, as gsplat's `duplicate` and `split` do.
 
-    Meanwhile its optimizer has no state, by which training/trainer.py recognizes that memory ran out.
-
     Args:
         param_fn: Makes the new parameter from its name and the old one.
         optimizer_fn: Makes a new moment from its key and the old one; `step` stays.

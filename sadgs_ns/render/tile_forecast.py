@@ -50,7 +50,6 @@ class TileForecast:
     Attributes:
         round_to_powers: Whether capacities are rounded up to powers of two and one and a half times these, so that
             only few different ones occur.
-        times_overflowed: Number of calls that drew nothing so far, because they needed more places.
     """
 
     def __init__(self) -> None:
@@ -59,7 +58,6 @@ class TileForecast:
         self._changes: deque[tuple[int, float]] = deque(maxlen=RECENT)  # epoch of the visit before, and the factor
         self._calls: deque[_Call] = deque()
         self.round_to_powers = False
-        self.times_overflowed = 0
 
     def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
         """Predict how many places the tile lists of a call should have.
@@ -99,7 +97,6 @@ class TileForecast:
                 if before is not None and call.epoch == self._epoch:
                     self._changes.append((before.epoch, (num_pairs + _SMALL) / (before.num_pairs + _SMALL)))
             if call.capacity is not None and sum(counts) > call.capacity:
-                self.times_overflowed += 1
                 lost += call.views
         return lost
 
