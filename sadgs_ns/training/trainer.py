@@ -220,7 +220,7 @@ class SadgsTrainer(Trainer):
     def _resume(self) -> str:
         """What to tell the user after an error between two checkpoints."""
         if not any(self.checkpoint_dir.glob("*.ckpt")):
-            return "no checkpoint was made yet"
+            return "this run has made no checkpoint yet"
         return f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:

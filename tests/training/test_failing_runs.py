@@ -654,7 +654,7 @@ def test_full_memory_ends_the_run_with_a_sentence_that_says_what_helps(steps: in
     assert re.fullmatch(
         r"The GPU's memory was full at iteration 4 with \d+ Gaussians \(CUDA out of memory\. Tried to allocate 2\.00 "
         r"GiB\): lower --pipeline\.model\.strategy\.max-gaussians or --pipeline\.views-per-iteration, or take smaller "
-        rf"images .*; {kept if steps else 'no checkpoint was made yet'}\.",
+        rf"images .*; {kept if steps else 'this run has made no checkpoint yet'}\.",
         str(stopped.value),
     )
 
