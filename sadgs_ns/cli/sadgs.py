@@ -63,7 +63,8 @@ _ON_CPU = (
 class Sadgs:
     """From photos or a video to a splat that opens in a browser: cameras (sadgs-process), training (ns-train sadgs) and
     export (sadgs-export), each of which is a command of its own, too. Run the same command again to resume; nothing is
-    done twice. Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`."""
+    done twice. Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`; `sadgs -- --help`
+    lists them."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
     """Folder of photos or of videos, or a video."""
@@ -312,8 +313,8 @@ class PhotosToSplat:
         line.update("going on" if begun else "starting")
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
-        measures = "--steps-per-eval" in " ".join(self.train_options).replace("_", "-")  # for which there is a logger
-        command += ["--timestamp", self._run.name, "--vis", "tensorboard" if measures else "none"]
+        measures = any(re.match("--steps[-_]per[-_]eval", option) for option in self.train_options)
+        command += ["--timestamp", self._run.name, "--vis", "tensorboard" if measures else "none"]  # for the measures
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
         worker = self._trainer or self.worker("training", _TRAINING)
@@ -401,7 +402,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Make a splat and return the exit code, as `exit_code` says."""
     words, console, start = list(sys.argv[1:] if argv is None else argv), Console(highlight=False), time.monotonic()
     end = words.index("--") if "--" in words else len(words)
-    options, train_options = parse(Sadgs, "sadgs", words[:end]), words[end + 1 :]
+    train_options = words[end + 1 :]
+    if not {"-h", "--help"}.isdisjoint(train_options):
+        from sadgs_ns.training.start import read_options  # It imports torch.
+
+        read_options(train_options)  # It prints the help and exits.
+    options = parse(Sadgs, "sadgs", words[:end])
     redirect_on_broken_pipe(console)
 
     def run() -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import random
 import sys
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -21,15 +22,16 @@ from sadgs_ns.training.config import SadgsTrainerConfig  # noqa: E402
 from sadgs_ns.training.presets import sadgs  # noqa: E402
 
 
+def read_options(words: Sequence[str]) -> SadgsTrainerConfig:
+    """Return what these options of `ns-train sadgs` ask for, or print an error or their help, and exit."""
+    annotated = SuppressFixed[FlagConversionOff[SadgsTrainerConfig]]  # as nerfstudio annotates its methods
+    return tyro.cli(annotated, prog="ns-train sadgs", args=words, default=copy.deepcopy(sadgs.config))
+
+
 def train() -> None:
     """Do what `ns-train` does with `sys.argv`, whose first two words are `ns-train sadgs`."""
     report("imported")
-    config = tyro.cli(
-        SuppressFixed[FlagConversionOff[SadgsTrainerConfig]],  # as nerfstudio annotates its methods
-        prog=" ".join(sys.argv[:2]),
-        args=sys.argv[2:],
-        default=copy.deepcopy(sadgs.config),
-    )
+    config = read_options(sys.argv[2:])
     if config.data:
         config.pipeline.datamanager.data = config.data
     config.set_timestamp()

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from PIL import Image
+from processes import HANGS
 from rich.console import Console
 from room import draw_photos
 from runs import nerfstudio_data
@@ -334,6 +335,14 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     assert main([source, "-o", "others/letter.txt/below"]) == 1
     assert "could not be written (Not a directory" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_options_for_training_are_listed_without_any_work(tmp_path: Path):
+    code = "import sys; from sadgs_ns.cli.sadgs import main; sys.exit(main(['--', '--help']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=HANGS)
+    assert done.returncode == 0, done.stderr
+    assert "--max-num-iterations" in done.stdout and done.stdout.count("\n") > 100
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.fixture
