@@ -835,10 +835,10 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     monkeypatch.setattr(
         "sadgs_ns.cli.cameras.matching.write_matches", lambda database, pairs, device: calls.append((*pairs, device))
     )
-    monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: calls.append(("verified",)))
+    monkeypatch.setattr(pycolmap, "geometric_verification", lambda database, **options: calls.append(("verified",)))
     device = torch.device("cpu")
-    match(["a.png", "b.png"], tmp_path / "db", "exhaustive", device)
-    assert calls == [(("a.png", "b.png"), device), ("verified",)]
+    match(["a 1.png", "a 2.png"], tmp_path / "db", "exhaustive", device)
+    assert calls == [(("a 1.png", "a 2.png"), device), ("verified",)]
 
 
 @pytest.mark.hard_case(

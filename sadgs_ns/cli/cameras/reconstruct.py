@@ -97,11 +97,11 @@ def wake_gpu() -> torch.device | None:
     """Import torch, and return the CUDA device if there is one, ready to compute."""
     import torch
 
+    import_module("sadgs_ns.cli.cameras.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
     if not torch.cuda.is_available():
         return None
     device = torch.device("cuda")
     torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first ones on a device start it.
-    import_module("sadgs_ns.cli.cameras.matching")
     return device
 
 
@@ -149,21 +149,20 @@ def match(
 ) -> None:  # fmt: skip
     """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
-    The GPU compares features unless COLMAP chooses the pairs; None leaves all to COLMAP. A file `pairs.txt` is written
-    beside the database.
+    The GPU compares features, if there is one, and COLMAP verifies the matches. Without one COLMAP does all, and a file
+    `pairs.txt` is written beside the database.
     """
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
+    progress(stage, 0, 1)
     # COLMAP separates the names in a list of pairs by spaces.
-    if any(character.isspace() for name in names for character in name):
-        progress(stage, 0, 1)  # These functions do not report their progress.
+    if gpu is None and any(character.isspace() for name in names for character in name):
         function = pycolmap.match_sequential if matching == "sequential" else pycolmap.match_exhaustive
-        function(database, verification_options=verification)
+        function(database, verification_options=verification)  # It does not report its progress.
         progress(stage, 1, 1)
         return
-    progress(stage, 0, 1)
     if matching == "similar":
         from sadgs_ns.cli.cameras.matching import similar_photos
 
@@ -178,10 +177,12 @@ def match(
         if gpu is not None:
             from sadgs_ns.cli.cameras.matching import write_matches
 
-            write_matches(database, chunk, gpu)  # COLMAP then only verifies these.
-        pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
-        pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
-        pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+            write_matches(database, chunk, gpu)
+            pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+        else:
+            pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
+            pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
     progress(stage, len(pairs), len(pairs))
 
 
