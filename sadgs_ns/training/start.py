@@ -17,12 +17,14 @@ from sadgs_ns.training.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # It precedes what imports nerfstudio.
 
+from nerfstudio.engine.trainer import TrainerConfig  # noqa: E402
+
 from sadgs_ns.training import trainer  # noqa: E402, F401 - a run's config imports it when it begins
 from sadgs_ns.training.config import SadgsTrainerConfig  # noqa: E402
 from sadgs_ns.training.presets import sadgs  # noqa: E402
 
 
-def read_options(words: Sequence[str]) -> SadgsTrainerConfig:
+def read_options(words: Sequence[str]) -> TrainerConfig:
     """Return what these options of `ns-train sadgs` ask for, or print an error or their help, and exit."""
     annotated = SuppressFixed[FlagConversionOff[SadgsTrainerConfig]]  # as nerfstudio annotates its methods
     return tyro.cli(annotated, prog="ns-train sadgs", args=words, default=copy.deepcopy(sadgs.config))
