@@ -310,6 +310,7 @@ class PhotosToSplat:
                 count = f"{fields['gaussians']:,}"
 
         begun = bool(self._checkpoint())
+        self._note(trained=None)  # The folder of an earlier run may have been deleted.
         line.update("going on" if begun else "starting")
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
@@ -347,6 +348,7 @@ class PhotosToSplat:
                 self.timeline.begin("export", written[-1].name.removeprefix("splat."))
 
         if jobs:
+            line.update("starting")
             self.call(self._exporter or self.worker("export", _EXPORT), line, on_event, [], jobs)
             return told()
         for sentence in done[:-1]:

@@ -365,7 +365,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
         on_event("training begins", iterations=8, on_cpu=False)
         on_event("iteration", step=7, left="")
-        (work._run / "nerfstudio_models").mkdir(parents=True)
+        (work._run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
         (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()
 
     monkeypatch.setattr(PhotosToSplat, "call", call)
@@ -379,6 +379,24 @@ def test_there_is_a_logger_where_held_out_views_are_measured(scene: Path, tmp_pa
         assert main([str(scene), "-o", output, "--formats", "ply", "--", *options]) == 0
         command = commands[-2]
         assert command[command.index("--vis") + 1] == logger
+
+
+def test_training_is_not_done_before_if_its_folder_was_deleted(
+    scene: Path, tmp_path: Path, commands: list[list[str]], monkeypatch: pytest.MonkeyPatch
+):
+    arguments, call = [str(scene), "-o", str(tmp_path / "out"), "--formats", "ply"], PhotosToSplat.call
+
+    def interrupted(*others: Any) -> None:
+        call(*others)
+        raise KeyboardInterrupt
+
+    assert main(arguments) == 0
+    shutil.rmtree(tmp_path / "out" / "training")
+    with monkeypatch.context() as patch:
+        patch.setattr(PhotosToSplat, "call", interrupted)
+        assert main(arguments) == 130
+    commands.clear()
+    assert main(arguments) == 0 and commands[0][0] == "ns-train"
 
 
 def test_the_process_that_exports_starts_while_training_runs(
