@@ -35,7 +35,8 @@ def assigned(source: str) -> set[str]:
         elif isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Store):
             found |= {ast.unparse(node)} if getattr(node.slice, "value", None) in RATES else set()
         elif isinstance(node, ast.Call) and ast.unparse(node.func) == "setattr":
-            found |= {ast.unparse(node)} if ast.unparse(node.args[0]) != "parser" else set()  # of nerfstudio's data
+            others = ("parser", "sys.modules[parent]")  # nerfstudio's parser of data, and a package
+            found |= {ast.unparse(node)} if ast.unparse(node.args[0]) not in others else set()
     return found
 
 
