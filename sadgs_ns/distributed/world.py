@@ -42,7 +42,7 @@ class World:
 
     @cached_property
     def uses_kernels(self) -> bool:
-        """Whether Triton's kernels work in all processes."""
+        """Whether Triton's kernels work in all processes, which ask each other the first time."""
         return self.all(use_triton(self.device))
 
     @property

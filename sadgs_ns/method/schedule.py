@@ -119,6 +119,6 @@ def growth_threshold(effort: float) -> float:
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
     """Interpolate a factor on a learning rate, which is 1 in steps of one view, to steps of several views.
 
-    It is measured for steps of four views, `at_four`, > 0; factors between lie on a power of the number of views.
+    From four views on it is `at_four`, > 0; below, it is the power of the number of views that is `at_four` at four.
     """
     return float(at_four ** min(math.log(views_per_iteration, MOST_VIEWS), 1.0))

@@ -289,8 +289,7 @@ class SadgsModel(SplatfactoModel):
             if not in_viewer():
                 raise
             warn_once(str(error))
-            width, height = int(camera.width.item()), int(camera.height.item())
-            outputs = self.get_empty_outputs(width, height, self.background)
+            outputs = self.get_empty_outputs(int(camera.width), int(camera.height), self.background)
         if in_viewer():
             return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
         params = self.cropped(dict(self.gauss_params.items()))

@@ -80,8 +80,8 @@ def plan_run(
         if before is not None and same and cap > before.strategy.max_gaussians:
             cap = before.strategy.max_gaussians
             note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
-    growth, more = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
-    clone, split = growth * strategy.clone_grad2d * more, growth * strategy.split_absgrad2d * more
+    of_effort, of_start = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
+    clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
     windows = planned.windows

@@ -60,8 +60,8 @@ def cpu_notice(threads: int) -> str:
         "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
         "fast."
     )
-    advice = f"It computes with {threads} threads; beside other work one is quicker: put OMP_NUM_THREADS=1 before the "
-    return f"{text} {advice}command." if threads > 1 else text
+    remedy = "beside other work one is quicker: put OMP_NUM_THREADS=1 before the command."
+    return text if threads == 1 else f"{text} It computes with {threads} threads; {remedy}"
 
 
 def next_commands(config: Path, gaussians: int) -> str:

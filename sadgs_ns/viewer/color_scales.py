@@ -102,9 +102,9 @@ def _add_bar(figure: Figure, scale: Scale, **place: Any) -> Colorbar:
     from matplotlib.cm import ScalarMappable
 
     form = f"%.2g {scale.unit}".rstrip()
-    bar = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ticks=scale.ticks, format=form, **place)
-    bar.minorticks_off()
-    return bar
+    added = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ticks=scale.ticks, format=form, **place)
+    added.minorticks_off()
+    return added
 
 
 @dataclass(frozen=True)
