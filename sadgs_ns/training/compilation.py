@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,38 +19,59 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.statistics import empty_statistics, observe
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
-from sadgs_ns.render.types import Cameras, Gaussians
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+from sadgs_ns.training.nonfinite import MAX_GRADIENT
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 
 _GAUSSIANS, _SIZE = 64, 64
 """Number of Gaussians, and width and height in px, with which the kernels are tried."""
+_DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
 _PATIENCE = 2.0
 """Seconds after which the user is told what the run is waiting for."""
 
 
-class _Stages:
+@dataclass(frozen=True)
+class KernelChoice:
+    """What decides which kernels a run launches, and how they are specialised; the defaults are the method's."""
+
+    device: torch.device
+    views: int = 2
+    """Views of a step."""
+    sh_degree: int = 3
+    is_black: bool = True
+    """Whether nothing is drawn behind the Gaussians."""
+    has_color_matrices: bool = False
+    alone: bool = True
+    """Whether one device holds all Gaussians."""
+    size: tuple[int, int] = (_SIZE, _SIZE)
+    """Largest width and height of the images, in px."""
+    drawing: RenderOptions = _DRAWING
+    """With the backend that draws, and a near plane in front of the Gaussians that are tried."""
+    updates: tuple[tuple[tuple[int, ...], ...], ...] = (((3,), (15, 3), (3,), (1,), (4,), (3,)),)
+    """Of each launch of Adam the shapes of its parameters, without their first dimension."""
+    structure_tensor: Callable[[Tensor], Tensor] = field(default=multiscale_structure_tensor, compare=False)
+
+
+class Stages:
     """The stages of a training step on a few Gaussians, each a method that launches its kernels."""
 
-    def __init__(self, pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
-        self.pipeline, self.optimizers = pipeline, optimizers
-        self.model, self.device, self.views = pipeline.model, pipeline.device, pipeline.model.plan.views_per_iteration
-        n, device = _GAUSSIANS, pipeline.device
-        ramp = torch.linspace(-0.5, 0.5, n, device=device)
+    def __init__(self, choice: KernelChoice) -> None:
+        self.choice, self.drawing, self.views = choice, choice.drawing, choice.views
+        n, self.device = _GAUSSIANS, choice.device
+        ramp = torch.linspace(-0.5, 0.5, n, device=self.device)
         self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
         quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
         self.scales, self.opacities = torch.full_like(self.means, 0.05), torch.full_like(ramp, 0.5)
         self.gaussians = Gaussians(self.means, quats, self.scales, self.opacities, self.means)
-        viewmats = torch.eye(4, device=device).repeat(self.views, 1, 1)
+        viewmats = torch.eye(4, device=self.device).repeat(self.views, 1, 1)
         intrinsics = [[_SIZE, 0.0, _SIZE / 2], [0.0, _SIZE, _SIZE / 2], [0.0, 0.0, 1.0]]
         Ks = self.means.new_tensor(intrinsics).repeat(self.views, 1, 1)
-        self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=device).view(1, _SIZE, _SIZE, 3)
+        self.image = torch.linspace(0.0, 1.0, 3 * _SIZE * _SIZE, device=self.device).view(1, _SIZE, _SIZE, 3)
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
-        # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
-        self.drawing = replace(self.model.drawing, near_plane=NEAR_PLANE)
         self.info: dict[str, Any] = {}  # the rasterizer's, once `project` was called
 
     def alone(self) -> dict[str, Callable[[], None]]:
@@ -62,18 +83,18 @@ class _Stages:
             "the loss of masked images": partial(self.loss, torch.float32),
             "activations": self.activations,
         }
-        return stages if self.model.color_matrices is None else stages | {"colour matrices": self.colors}
+        return stages | {"colour matrices": self.colors} if self.choice.has_color_matrices else stages
 
     def after_projection(self) -> dict[str, Callable[[], None]]:
         """Return the stages that read what `project` has computed."""
         stages = {"η": self.observation, "compositing with AbsGS": partial(self.composite, True)}
-        if self.model.backend == "triton":
+        if self.drawing.backend == "triton":
             stages |= {
                 "projection and spherical harmonics": self.projection,
                 "tile lists": self.tile_lists,
                 "compositing": partial(self.composite, False),
             }
-        return stages if self.model.world.alone else stages | {"what travels between devices": self.exchange}
+        return stages if self.choice.alone else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
@@ -81,16 +102,13 @@ class _Stages:
     def tile_lists(self) -> None:
         # The run's image size decides between tile numbers of 16 and 32 bits; lists of a given length have one more row
         # of tiles.
-        sizes = self.pipeline.datamanager.train_dataset.cameras
-        cameras = self.cameras._replace(width=int(sizes.width.max()), height=int(sizes.height.max()))
+        width, height = self.choice.size
+        cameras = self.cameras._replace(width=width, height=height)
         for capacity in (None, 2**20):
             rasterize(self.gaussians, cameras, replace(self.drawing, tile_capacity=capacity))
 
-    def blank(self, name: str) -> Tensor:
-        return self.means.new_zeros((_GAUSSIANS, *self.model.gauss_params[name].shape[1:]))
-
     def structure(self) -> None:
-        quantize(self.pipeline.structure_cache.of_images(self.image))
+        quantize(self.choice.structure_tensor(self.image))
 
     def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
         predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()
@@ -103,26 +121,24 @@ class _Stages:
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def update(self) -> None:
-        twins: dict[str, FusedAdam] = {}
-        for name, optimizer in self.optimizers.items():
-            if name in self.model.trained_params:
-                # There are fewer colour matrices than Gaussians, so that they take another launch.
-                known = name in self.model.gauss_params
-                value = self.blank(name) if known else torch.zeros((1, 3, 4), device=self.device)
-                options = {key: optimizer.defaults[key] for key in ("betas", "eps")}
-                if value.numel():
-                    twins[name] = FusedAdam([torch.nn.Parameter(value)], **options)
-        update = AdamUpdate(twins)
-        gradients = {name: torch.zeros_like(parameter) for name, parameter in update.parameters.items()}
+        from sadgs_ns.kernels.adam import adam_step
+
+        factors = torch.zeros((2, sum(map(len, self.choice.updates))), device=self.device)
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
-        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.model.world.alone else ()
-        update.launch(gradients, update.factors().to(self.device), torch.zeros(1, device=self.device), flags)
+        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.alone else ()
+        begin, noted = 0, torch.zeros(1, device=self.device)
+        for shapes in self.choice.updates:
+            part, begin = slice(begin, begin + len(shapes)), begin + len(shapes)
+            tensors = [tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes) for _ in range(4)]
+            adam_step(
+                *tensors, factors[:, part], noted, flags, betas=(0.9, 0.999), eps=1e-15, max_gradient=MAX_GRADIENT
+            )
 
     def composite(self, absgrad: bool) -> None:
         gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
         renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.drawing, absgrad=absgrad))
-        black = self.model.config.background_color == "black" and self.model.color_matrices is None
-        result = renders.sum() if black else renders.sum() + alphas.sum()
+        opaque = self.choice.is_black and not self.choice.has_color_matrices
+        result = renders.sum() if opaque else renders.sum() + alphas.sum()
         # The projection is differentiated elsewhere.
         (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
@@ -138,14 +154,12 @@ class _Stages:
         from sadgs_ns.kernels.harmonics import colors_from_harmonics
         from sadgs_ns.kernels.projection import project
 
-        config = self.model.config
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
         radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
         results = [means2d, conics]
-        if config.sh_degree > 0:
-            coefficients = self.blank("features_dc"), self.blank("features_rest")
-            viewmats = self.cameras.viewmats
-            results.append(colors_from_harmonics(config.sh_degree, centres, *coefficients, viewmats, radii))
+        if (degree := self.choice.sh_degree) > 0:
+            rest = self.means.new_zeros((_GAUSSIANS, (degree + 1) ** 2 - 1, 3))
+            results.append(colors_from_harmonics(degree, centres, self.means, rest, self.cameras.viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])
 
     def observation(self) -> None:
@@ -163,6 +177,30 @@ class _Stages:
         unpack(pack(*(value.contiguous() for value in (*seen, colors)), places=places), 0)
 
 
+def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:
+    """Return what decides the kernels of a run."""
+    model, sizes = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
+    for name, optimizer in optimizers.items():
+        value = model.trained_params.get(name)
+        if value is not None and value.numel():
+            key = name in model.gauss_params, optimizer.defaults["betas"], optimizer.defaults["eps"]
+            alike.setdefault(key, []).append(tuple(value.shape[1:]))
+    return KernelChoice(
+        device=pipeline.device,
+        views=model.plan.views_per_iteration,
+        sh_degree=model.config.sh_degree,
+        is_black=model.config.background_color == "black",
+        has_color_matrices=model.color_matrices is not None,
+        alone=model.world.alone,
+        size=(int(sizes.width.max()), int(sizes.height.max())),
+        # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
+        drawing=replace(model.drawing, near_plane=NEAR_PLANE, backend=model.backend),
+        updates=tuple(map(tuple, alike.values())),
+        structure_tensor=pipeline.structure_cache.of_images,
+    )
+
+
 def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
     """Launch the kernels of training once, on a few Gaussians and in threads, so that their compilations overlap.
 
@@ -172,7 +210,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     device = pipeline.device
     if not use_triton(device):
         return
-    stages = _Stages(pipeline, optimizers)
+    stages = Stages(choose_kernels(pipeline, optimizers))
     failures: dict[str, BaseException] = {}
     pending: dict[str, Future[None]] = {}
 

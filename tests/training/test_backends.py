@@ -104,7 +104,7 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
 def test_of_kernels_that_draw_none_is_compiled_ahead(config: SadgsTrainerConfig, drawn: list[int]):
     pipeline = set_up(config).pipeline
     drawn.clear()  # With CUDA the setup compiles, too.
-    stages = compilation._Stages(pipeline, {})
+    stages = compilation.Stages(compilation.choose_kernels(pipeline, {}))
     stages.project()
     assert stages.after_projection().keys() == {"η", "compositing with AbsGS"}
     for stage in stages.after_projection().values():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -66,7 +67,7 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
     monkeypatch.setattr(compilation, "rasterize", rasterize)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", None)
-    for name in ("quantize", "photometric_loss", "AdamUpdate", "observe"):
+    for name in ("quantize", "photometric_loss", "observe"):
         monkeypatch.setattr(compilation, name, None)  # the stages that need a GPU end at once
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     cameras = trainer.pipeline.datamanager.train_dataset.cameras
@@ -81,6 +82,8 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
 ):
     """In Triton's interpreter all run but what needs a projection, which is gsplat's and needs CUDA."""
     pytest.importorskip("triton", reason="Triton is not installed")
+    from sadgs_ns.kernels import adam
+
     trainer = SadgsTrainer(config)
     trainer.setup()
     launched = []
@@ -90,18 +93,19 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
         compilation, "ThreadPoolExecutor", lambda **options: ThreadPoolExecutor(1, **options)
     )  # the interpreter knows one thread
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    for name in ("quantize", "photometric_loss", "AdamUpdate", "rasterize", "observe", "activate"):
-        original = getattr(compilation, name)
+    names = dict.fromkeys(("quantize", "photometric_loss", "rasterize", "observe", "activate"), compilation)
+    for name, module in (names | {"adam_step": adam}).items():
+        original = getattr(module, name)
 
         def launch(*args, name=name, original=original, **options):
             launched.append(name)
             return original(*args, **options)
 
-        monkeypatch.setattr(compilation, name, launch)
+        monkeypatch.setattr(module, name, launch)
     parameters = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
-    assert sorted(launched) == ["AdamUpdate", *["activate"] * 2, *["photometric_loss"] * 2, "quantize", "rasterize"]
+    assert sorted(launched) == [*["activate"] * 2, "adam_step", *["photometric_loss"] * 2, "quantize", "rasterize"]
     assert "The kernels of rasterization could not be compiled and tried before training (" in capsys.readouterr().out
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())
@@ -122,8 +126,8 @@ def test_kernels_that_fail_are_told_in_one_sentence(
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(compilation, "rasterize", lambda *args, **options: (None, None, {}))
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", lambda image: image)
-    for name in ("AdamUpdate", "observe"):
-        monkeypatch.setattr(compilation, name, lambda *args, **options: None)
+    monkeypatch.setattr(compilation, "observe", lambda *args, **options: None)
+    monkeypatch.setattr(compilation.Stages, "update", lambda self: None)
     monkeypatch.setattr(compilation, "quantize", full)
     monkeypatch.setattr(compilation, "photometric_loss", full)
     before = set(threading.enumerate())
@@ -135,4 +139,15 @@ def test_kernels_that_fail_are_told_in_one_sentence(
     assert told.count("could not be compiled") == 1
     assert "The kernels of the loss, S̄" in told
     assert "(CUDA out of memory. Tried to allocate 2 GiB): training tries them again" in told
+    trainer.shutdown()
+
+
+def test_a_run_of_the_defaults_takes_the_kernels_that_are_chosen_without_it(config: SadgsTrainerConfig):
+    """Those that can be compiled before the data is known."""
+    trainer = SadgsTrainer(config)
+    trainer.setup()
+    chosen = compilation.choose_kernels(trainer.pipeline, trainer.optimizers.optimizers)
+    drawing = replace(chosen.drawing, backend="triton")
+    default = compilation.KernelChoice(trainer.pipeline.device, views=chosen.views, size=chosen.size)
+    assert replace(chosen, drawing=drawing) == default
     trainer.shutdown()
