@@ -22,6 +22,7 @@ from sadgs_ns.training import compilation
 from sadgs_ns.training import config as config_module
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.stages import Stages
 from sadgs_ns.training.trainer import SadgsTrainer
 
 ON_GPU = torch.cuda.is_available()
@@ -104,7 +105,7 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
 def test_of_kernels_that_draw_none_is_compiled_ahead(config: SadgsTrainerConfig, drawn: list[int]):
     pipeline = set_up(config).pipeline
     drawn.clear()  # With CUDA the setup compiles, too.
-    stages = compilation.Stages(compilation.choose_kernels(pipeline, {}))
+    stages = Stages(compilation.choose_kernels(pipeline, {}))
     stages.project()
     assert stages.after_projection().keys() == {"η", "compositing with AbsGS"}
     for stage in stages.after_projection().values():

@@ -12,7 +12,7 @@ import torch
 from triton_compiler import run_with_the_compiler
 
 from sadgs_ns import kernels
-from sadgs_ns.training import compilation
+from sadgs_ns.training import compilation, stages
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.trainer import SadgsTrainer
 
@@ -64,11 +64,11 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
         sizes.append((cameras.width, cameras.height))
         return None, None, {}
 
-    monkeypatch.setattr(compilation, "rasterize", rasterize)
+    monkeypatch.setattr(stages, "rasterize", rasterize)
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", None)
     for name in ("quantize", "photometric_loss", "observe"):
-        monkeypatch.setattr(compilation, name, None)  # the stages that need a GPU end at once
+        monkeypatch.setattr(stages, name, None)  # the stages that need a GPU end at once
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     cameras = trainer.pipeline.datamanager.train_dataset.cameras
     assert (int(cameras.width.max()), int(cameras.height.max())) in sizes and (64, 64) in sizes
@@ -87,13 +87,13 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     trainer = SadgsTrainer(config)
     trainer.setup()
     launched = []
-    monkeypatch.setattr(compilation, "_SIZE", 12)  # the interpreter is slow, and would take half a minute for S̄
+    monkeypatch.setattr(stages, "_SIZE", 12)  # the interpreter is slow, and would take half a minute for S̄
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", lambda image: image)
     monkeypatch.setattr(
         compilation, "ThreadPoolExecutor", lambda **options: ThreadPoolExecutor(1, **options)
     )  # the interpreter knows one thread
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    names = dict.fromkeys(("quantize", "photometric_loss", "rasterize", "observe", "activate"), compilation)
+    names = dict.fromkeys(("quantize", "photometric_loss", "rasterize", "observe", "activate"), stages)
     for name, module in (names | {"adam_step": adam}).items():
         original = getattr(module, name)
 
@@ -124,12 +124,12 @@ def test_kernels_that_fail_are_told_in_one_sentence(
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nOf no interest.")
 
     monkeypatch.setattr(kernels, "available", lambda device: True)
-    monkeypatch.setattr(compilation, "rasterize", lambda *args, **options: (None, None, {}))
+    monkeypatch.setattr(stages, "rasterize", lambda *args, **options: (None, None, {}))
     monkeypatch.setattr(trainer.pipeline.structure_cache, "of_images", lambda image: image)
-    monkeypatch.setattr(compilation, "observe", lambda *args, **options: None)
-    monkeypatch.setattr(compilation.Stages, "update", lambda self: None)
-    monkeypatch.setattr(compilation, "quantize", full)
-    monkeypatch.setattr(compilation, "photometric_loss", full)
+    monkeypatch.setattr(stages, "observe", lambda *args, **options: None)
+    monkeypatch.setattr(stages.Stages, "update", lambda self: None)
+    monkeypatch.setattr(stages, "quantize", full)
+    monkeypatch.setattr(stages, "photometric_loss", full)
     before = set(threading.enumerate())
     capsys.readouterr()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
@@ -148,6 +148,6 @@ def test_a_run_of_the_defaults_takes_the_kernels_that_are_chosen_without_it(conf
     trainer.setup()
     chosen = compilation.choose_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     drawing = replace(chosen.drawing, backend="triton")
-    default = compilation.KernelChoice(trainer.pipeline.device, views=chosen.views, size=chosen.size)
+    default = stages.KernelChoice(trainer.pipeline.device, views=chosen.views, size=chosen.size)
     assert replace(chosen, drawing=drawing) == default
     trainer.shutdown()
