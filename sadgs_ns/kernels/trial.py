@@ -1,6 +1,9 @@
-"""The smallest kernel, which shows whether Triton works on a device."""
+"""The smallest kernel, which shows whether Triton works on a device, and the order in which Triton hashes kernels."""
 
 from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
 
 import torch
 import triton
@@ -14,7 +17,20 @@ def _write_one(target):
 
 def run_trial(device: torch.device) -> None:
     """Run a kernel on a device and wait for it; raise whatever Triton raises, or RuntimeError if it did nothing."""
+    hash_kernels()
     target = torch.zeros(1, device=device)
     _write_one[1,](target)
     if float(target) != 1:
         raise RuntimeError("a kernel ran and changed nothing")
+
+
+def hash_kernels() -> None:
+    """Have Triton hash all kernels in one order, before the first is launched, so that another process finds them.
+
+    In Triton 3.6 the hash of a kernel, by which its cache is searched, depends on whether the functions that it calls
+    were hashed before.
+    """
+    for path in sorted(Path(__file__).parent.glob("[!_]*.py")):
+        for value in vars(import_module(f"sadgs_ns.kernels.{path.stem}")).values():
+            if isinstance(value, triton.JITFunction):
+                _ = value.cache_key
