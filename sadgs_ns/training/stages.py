@@ -121,10 +121,12 @@ class Stages:
         begin, noted = 0, torch.zeros(1, device=self.device)
         for shapes in self.choice.updates:
             part, begin = slice(begin, begin + len(shapes)), begin + len(shapes)
-            tensors = [tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes) for _ in range(4)]
+            # Gradients and both moments may be the parameters themselves: they are all zero.
+            values = tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes)
             adam_step(
-                *tensors, factors[:, part], noted, flags, betas=(0.9, 0.999), eps=1e-15, max_gradient=MAX_GRADIENT
-            )
+                values, values, values, values, factors[:, part], noted, flags,
+                betas=(0.9, 0.999), eps=1e-15, max_gradient=MAX_GRADIENT,
+            )  # fmt: skip
 
     def composite(self, absgrad: bool) -> None:
         gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
