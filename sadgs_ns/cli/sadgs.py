@@ -306,6 +306,8 @@ class PhotosToSplat:
                 self._exporter = self._exporter or self.worker("export", _EXPORT)
                 left = f", about {fields['left']} left" if fields["left"] else ""
                 line.update(f"iteration {fields['step']:,} of {total}{left}")
+            elif event == "progress":
+                line.update(f"{fields['stage']} {fields['done']} of {fields['total']}")
             elif event == "training ends":
                 count = f"{fields['gaussians']:,}"
 

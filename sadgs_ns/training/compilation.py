@@ -1,9 +1,9 @@
-"""Compiles a run's Triton kernels in parallel before training starts."""
+"""Compiles what a run needs of Triton's kernels before training starts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import torch
 from sadgs_ns.errors import reason
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import use_triton
+from sadgs_ns.training import compile_ahead
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.stages import KernelChoice, Stages
@@ -45,33 +46,33 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
 
 
 def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
-    """Launch the kernels of training once, on a few Gaussians and in threads, so that their compilations overlap.
+    """Launch the kernels of training once, on a few Gaussians, after those of `compile_ahead` are compiled.
 
     Triton keeps kernels on the disk, so only a machine's first run takes seconds here. The run's state, random numbers
     included, does not change. If kernels fail, a warning names them, and the run goes on: it may never need them.
     """
-    device = pipeline.device
-    if not use_triton(device):
+    if not use_triton(pipeline.device):
         return
-    stages = Stages(choose_kernels(pipeline, optimizers))
-    failures: dict[str, BaseException] = {}
-    pending: dict[str, Future[None]] = {}
+    failures: dict[str, Exception] = {}
 
-    def take_device() -> None:
-        if device.type == "cuda":  # Triton launches on the thread's device, which is the first one by default.
-            torch.cuda.set_device(device)
+    def launch(some: Mapping[str, Callable[[], None]]) -> bool:
+        for name, stage in some.items():
+            try:
+                stage()
+            except Exception as error:
+                failures[name] = error
+        return not some.keys() & failures.keys()
 
-    with ThreadPoolExecutor(initializer=take_device) as pool:
-        pending |= {name: pool.submit(stage) for name, stage in stages.alone().items()}
-        try:
-            stages.project()
-        except Exception as error:
-            failures["rasterization"] = error
-        else:
-            pending |= {name: pool.submit(stage) for name, stage in stages.after_projection().items()}
-        if wait(pending.values(), timeout=_PATIENCE).not_done:
-            note("Compiling kernels for this GPU, once …")
-    failures |= {name: error for name, future in pending.items() if (error := future.exception()) is not None}
+    patience = threading.Timer(_PATIENCE, note, ["Compiling kernels for this GPU, once …"])
+    patience.start()
+    try:
+        compile_ahead.wait()
+        stages = Stages(choose_kernels(pipeline, optimizers))
+        launch(stages.alone())
+        if launch({"rasterization": stages.project}):
+            launch(stages.after_projection())
+    finally:
+        patience.cancel()
     if failures:
         why = reason(next(iter(failures.values())))
         warn(

@@ -1,11 +1,16 @@
 """The start of training in `sadgs`: what `ns-train sadgs` does, without the import of all that nerfstudio has."""
 
+# ruff: noqa: E402 - what takes seconds begins before what is imported meanwhile
 from __future__ import annotations
 
 import copy
 import random
 import sys
 from collections.abc import Sequence
+
+from sadgs_ns.training import compile_ahead
+
+compile_ahead.begin()  # It goes on while the rest is imported.
 
 import numpy as np
 import torch
@@ -17,11 +22,11 @@ from sadgs_ns.training.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # It precedes what imports nerfstudio.
 
-from nerfstudio.engine.trainer import TrainerConfig  # noqa: E402
+from nerfstudio.engine.trainer import TrainerConfig
 
-from sadgs_ns.training import trainer  # noqa: E402, F401 - a run's config imports it when it begins
-from sadgs_ns.training.config import SadgsTrainerConfig  # noqa: E402
-from sadgs_ns.training.presets import sadgs  # noqa: E402
+from sadgs_ns.training import trainer  # noqa: F401 - a run's config imports it when it begins
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.presets import sadgs
 
 
 def read_options(words: Sequence[str]) -> TrainerConfig:

@@ -23,7 +23,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training import checkpoints, interrupts, processes
+from sadgs_ns.training import checkpoints, compile_ahead, interrupts, processes
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
@@ -63,6 +63,8 @@ class SadgsTrainer(Trainer):
         interrupts.redirect_on_broken_pipe(CONSOLE)
         config.check()
         config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
+        if config.machine.device_type == "cuda" and local_rank == 0:
+            compile_ahead.begin()
         self.world, local_rank = processes.join(config, local_rank)
         self._peers = None if self.world.alone else processes.Peers(self.world)
         if not self.world.alone:
