@@ -103,8 +103,8 @@ class ProgressTable(LocalWriter):
             return
         if step % writer.GLOBAL_BUFFER["steps_per_log"] != 0:
             return
-        cells = _cells(events)  # On CUDA this waits for the step, so the clock is read after it.
-        self._times.append((step, now := time.monotonic()))
+        cells, now = _cells(events), time.monotonic()  # On CUDA the former waits for the step.
+        self._times.append((step, now))
         self._first = self._first or self._times[0]
         total, timing = writer.GLOBAL_BUFFER["max_iter"], ["", ""]
         if step > self._times[0][0]:
