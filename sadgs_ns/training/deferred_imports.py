@@ -73,9 +73,9 @@ def import_nerfstudio() -> None:
             return general(*shapes)
 
     torch.broadcast_shapes = broadcast_shapes
-    StandIn.importing = True
     try:
         for importer, names in DEFERRED.items():
+            StandIn.importing = bool(names)  # Other packages may need what they ask for.
             true = {name: sys.modules.get(name) for name in names}
             for name in names:
                 sys.modules[name] = stand_in = StandIn(name, lambda name=name: import_module(name))
@@ -86,7 +86,9 @@ def import_nerfstudio() -> None:
                 import_module(importer)
             finally:
                 for name, module in true.items():
-                    del sys.modules[name]
-                    sys.modules.update({name: module} if module else {})
+                    if module is None:
+                        del sys.modules[name]
+                    else:
+                        sys.modules[name] = module
     finally:
         StandIn.importing = False
