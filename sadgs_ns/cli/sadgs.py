@@ -329,33 +329,30 @@ class PhotosToSplat:
         return told
 
     def _export(self, line: StatusLine) -> str:
-        checkpoint, jobs, done = self._checkpoint(), [], []
+        checkpoint, jobs, told = self._checkpoint(), [], []
         for name in self._formats:
             output = self.folder / f"splat.{name}"
             if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
-                done.append(f"{output}; done before")
+                told.append(f"{output}; done before")
             else:  # The folder may have been renamed since the run's config.yml noted where the scene is.
                 jobs.append(Export(self._run, output, data=self._data))
-        written: list[Path] = []
 
-        def told() -> str:
-            return f"{written[-1]}, {written[-1].stat().st_size / 1e6:,.1f} MB"
-
-        def on_event(event: str, **fields: Any) -> None:
+        def on_event(event: str, output: str) -> None:
             if event == "export begins":
-                for sentence in done if not written else [told()]:
-                    line.finish(sentence)
-                written.append(Path(fields["output"]))
-                line.update(str(written[-1]))
-                self.timeline.begin("export", written[-1].name.removeprefix("splat."))
+                while told:
+                    line.finish(told.pop(0))
+                line.update(output)
+                self.timeline.begin("export", Path(output).name.removeprefix("splat."))
+            elif event == "export ends":
+                told.append(f"{output}, {Path(output).stat().st_size / 1e6:,.1f} MB")
 
         if jobs:
             line.update("starting")
             self.call(self._exporter or self.worker("export", _EXPORT), line, on_event, [], jobs)
-            return told()
-        for sentence in done[:-1]:
+        *others, last = told
+        for sentence in others:
             line.finish(sentence)
-        return done[-1]
+        return last
 
 
 STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {

@@ -357,6 +357,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
                 called.append(["sadgs-export", "--data", str(job.data)])
                 job.output.touch()
                 on_event("export begins", output=str(job.output))
+                on_event("export ends", output=str(job.output))
             return
         called.append(command)
         if command[0] == "sadgs-process":

@@ -85,8 +85,9 @@ class _Scene:
             raise InputError(f"{out} exists and is not a scene that sadgs-process began; give another folder.")
         photos, self.is_video, self.masks, self.left_out = find_source(source, out)
         self.settings: dict[str, Any] = {"source": os.path.realpath(source), "photos": photos}
-        self.settings |= {"camera_per_photo": options.camera_per_photo}
-        self.settings |= {"frames": options.frames} if self.is_video else {}
+        self.settings["camera_per_photo"] = options.camera_per_photo
+        if self.is_video:
+            self.settings["frames"] = options.frames
         self.begun = read_settings(self.settings_file, out)
         self.finished = self.begun.get("finished") if (out / "transforms.json").exists() else None
         if self.begun:

@@ -20,5 +20,7 @@ def check_data(data: Path) -> Iterator[Finding]:
     layout = layout_of(data)
     if layout == "colmap":
         yield from check_colmap(data, automatic_options(data))
-    else:  # Without a known layout, the check of a transforms.json says what is missing.
-        yield from (check_blender if layout == "blender" else check_nerfstudio)(data, ParserOptions())
+    elif layout == "blender":
+        yield from check_blender(data, ParserOptions())
+    else:  # Without a known layout, this says what is missing.
+        yield from check_nerfstudio(data, ParserOptions())
