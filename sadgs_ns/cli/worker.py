@@ -65,7 +65,7 @@ class Worker:
     def __init__(self, function: str, log: Path, keep_open: Sequence[int] = (), saves: bool = False) -> None:
         self.log, self._events, self._saves = log, log.with_suffix(".events"), saves
         log.parent.mkdir(parents=True, exist_ok=True)
-        self._events.write_bytes(b"")
+        self._events.open("wb").close()
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
         with log.open("ab") as output:
             self._start = output.tell()

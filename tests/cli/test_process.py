@@ -39,7 +39,7 @@ from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 
 from sadgs_ns.cli.cameras import command as program
 from sadgs_ns.cli.cameras import features, reconstruct
-from sadgs_ns.cli.cameras.colmap import run_colmap
+from sadgs_ns.cli.cameras.colmap import Colmap, start_colmap
 from sadgs_ns.cli.cameras.command import Process, main, photos_added, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
 from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
@@ -510,7 +510,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
     made: dict[str, tuple[int, int]] = {}
     masks: dict[str, Any] = {}
 
-    def look(function: str, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
+    def look(self: Colmap, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
         assert groups == [["a.jpg", "b.jpg", "c.jpg", "d.jpg"]]
         for name in itertools.chain(*groups):
             with Image.open(photos / name) as image:
@@ -518,7 +518,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
         masks.update((path.name, Image.open(path).getextrema()) for path in (out / "work").glob("masks/*"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "run_colmap", look)
+    monkeypatch.setattr(Colmap, "make_model", look)
     assert main([str(source), str(out)]) == 130
     assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
@@ -693,10 +693,9 @@ def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     steps: list[str] = []
     model = tmp_path / "none" / "model"
     with pytest.raises(RunError, match=r"^COLMAP failed while it worked on features \(.+\); run the same com"):
-        run_colmap(
-            "make_model", tmp_path, [["a.png"]], "exhaustive", 0, model, None, [],
-            folder=tmp_path, report=lambda stage, *others: steps.append(stage),
-        )  # fmt: skip
+        arguments = tmp_path, [["a.png"]], "exhaustive", 0, model, None, []
+        with start_colmap() as colmap:
+            colmap.make_model(*arguments, folder=tmp_path, report=lambda stage, *others: steps.append(stage))
     assert steps == ["features"] and not list(tmp_path.iterdir())
 
 
@@ -721,12 +720,12 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has COLMAP register so many of 12 photos at once, instead of running it."""
 
     def register(count: int) -> None:
-        def stand_in(function: str, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
+        def stand_in(self: Colmap, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
             return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
 
-        monkeypatch.setattr(program, "run_colmap", stand_in)
+        monkeypatch.setattr(Colmap, "make_model", stand_in)
         monkeypatch.setattr(program, "_publish", lambda *others: None)
 
     return register
@@ -768,12 +767,12 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
 def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     command = [str(black(tmp_path / "photos", "a.png", "b.png", "c.png")), str(tmp_path / "out")]
 
-    def run_another(function: str, *arguments: object, folder: Path, **others: object) -> None:
+    def run_another(self: Colmap, *arguments: object, folder: Path, **others: object) -> None:
         (folder / "models").mkdir()
         assert main(command) == 2 and (folder / "models").is_dir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "run_colmap", run_another)
+    monkeypatch.setattr(Colmap, "make_model", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
@@ -1005,12 +1004,12 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The photos of every run, each of which is interrupted before it looks for features in them."""
     runs: list[list[str]] = []
 
-    def stop(function: str, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
+    def stop(self: Colmap, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
         assert all((photos / name).is_file() for name in itertools.chain(*groups))
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(program, "run_colmap", stop)
+    monkeypatch.setattr(Colmap, "make_model", stop)
     return runs
 
 

@@ -7,10 +7,13 @@ writes a PNG.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import signal
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,25 +28,38 @@ _LOG_PREFIX = re.compile(r"^([IWEF]\d{8} .*?\] |\s*what\(\):\s*)?(\[[\w.]+:\d+\]
 _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 
 
-def run_colmap(function: str, *arguments: Any, folder: Path, report: Report) -> Any:
-    """Call a function of `reconstruct.py`, which writes to `folder`, in another process, as `Worker.run` does.
+@dataclass(frozen=True)
+class Colmap:
+    """The process of COLMAP."""
 
-    Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
-    """
-    begun, log = "its start", folder / "colmap.txt"
+    worker: Worker
 
-    def on_event(event: str, stage: str, done: int, total: int) -> None:
-        nonlocal begun
-        begun = stage
-        report(stage, done, total)
+    def make_model(self, *arguments: Any, folder: Path, report: Report) -> Any:
+        """Call `reconstruct.make_model`, which writes to `folder`, as `Worker.run` does.
 
-    try:
-        with Worker(f"sadgs_ns.cli.cameras.reconstruct:{function}", log) as worker:
-            return worker.run(*arguments, on_event=on_event)
-    except WorkerError as error:
-        raise _error_of(error, begun, folder) from None
-    finally:
-        log.unlink(missing_ok=True)
+        Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
+        """
+        begun = "its start"
+
+        def on_event(event: str, stage: str, done: int, total: int) -> None:
+            nonlocal begun
+            begun = stage
+            report(stage, done, total)
+
+        try:
+            return self.worker.run(*arguments, on_event=on_event)
+        except WorkerError as error:
+            raise _error_of(error, begun, folder) from None
+
+
+@contextlib.contextmanager
+def start_colmap() -> Iterator[Colmap]:
+    """Start the process of COLMAP, which imports what it needs, and kill it when the context is left."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Worker("sadgs_ns.cli.cameras.colmap_process:make_model", Path(folder) / "colmap.txt") as worker,
+    ):
+        yield Colmap(worker)
 
 
 def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:

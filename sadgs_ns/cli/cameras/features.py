@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -14,6 +14,7 @@ import pycolmap
 from PIL import Image
 
 from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
+from sadgs_ns.cli.cameras.photos import threads
 from sadgs_ns.cli.cameras.plan import MAX_SIDE, searched_pixels
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
@@ -32,41 +33,46 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. The folder
     `masks` beside the database may hold masks, as `write_masks` writes them.
     """
-    total = sum(map(len, [*groups, *rigs]))
-    progress("features", 0, total)
+    names = list(itertools.chain(*groups, *rigs))
+    progress("features", 0, len(names))
     with pycolmap.Database.open(database) as opened:
-        known = {image.name: image.camera_id for image in opened.read_all_images()}
-    for group in groups:
-        if missing := [name for name in group if name not in known]:
-            reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
-            # An interrupted run has made the camera.
-            reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
-            pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
-    with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP believes.
-            side = max(camera.width, camera.height)
-            if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
-                camera.focal_length_x = camera.focal_length_y = 1.2 * side
-                camera.has_prior_focal_length = False
-                opened.update_camera(camera)
-        for views in (views for views in rigs if views[0] not in known):
-            with pycolmap.DatabaseTransaction(opened):
-                _add_panorama(opened, photos, views)
-        images = [image for image in opened.read_all_images() if not opened.exists_descriptors(image.image_id)]
-        done = total - len(images)
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        sizes = [(cameras[image.camera_id].width, cameras[image.camera_id].height) for image in images]
-        cv2.setNumThreads(1)  # Each thread of ours has a photo.
-        with ThreadPoolExecutor(_num_threads(sizes)) as pool:
-            masks = [database.with_name("masks") / f"{image.name}.png" for image in images]
-            found = pool.map(sift, [photos / image.name for image in images], masks)
-            for image, (keypoints, descriptors) in zip(images, found, strict=True):
+        known = {image.name: image for image in opened.read_all_images()}
+        done_before = {name for name, image in known.items() if opened.exists_descriptors(image.image_id)}
+    searched = [name for name in names if name not in done_before]
+    cv2.setNumThreads(1)  # Each thread of ours has a photo.
+    with threads(_num_threads([_size(photos / name) for name in searched])) as pool:
+        masks = database.with_name("masks")
+        found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in searched}
+        for group in groups:  # Meanwhile COLMAP reads all photos, one after the other.
+            if missing := [name for name in group if name not in known]:
+                reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
+                # An interrupted run has made the camera.
+                reader.existing_camera_id = next((known[name].camera_id for name in group if name in known), -1)
+                pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
+        with pycolmap.Database.open(database) as opened:
+            for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP believes.
+                side = max(camera.width, camera.height)
+                if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
+                    camera.focal_length_x = camera.focal_length_y = 1.2 * side
+                    camera.has_prior_focal_length = False
+                    opened.update_camera(camera)
+            for views in (views for views in rigs if views[0] not in known):
+                with pycolmap.DatabaseTransaction(opened):
+                    _add_panorama(opened, photos, views)
+            done = len(done_before)
+            for image in (image for image in opened.read_all_images() if image.name in found):
+                keypoints, descriptors = found.pop(image.name).result()
                 features = pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=descriptors)
                 with pycolmap.DatabaseTransaction(opened):
                     opened.write_keypoints(image.image_id, keypoints)
                     opened.write_descriptors(image.image_id, features)
                 done += 1
-                progress("features", done, total)
+                progress("features", done, len(names))
+
+
+def _size(photo: Path) -> tuple[int, int]:
+    with Image.open(photo) as image:
+        return image.size
 
 
 def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str]) -> None:
@@ -122,11 +128,7 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 
 
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
-    """Return how many photos of these sizes in px are searched at a time: one on most cores if memory allows.
-
-    Of 16 cores two are left for the import of torch, which goes on meanwhile.
-    """
+    """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
     pixels = max(map(searched_pixels, sizes), default=1.0)
     at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
-    cores = os.cpu_count() or 1
-    return max(1, int(min(cores - cores // 8, at_a_time)))
+    return max(1, int(min(os.cpu_count() or 1, at_a_time)))

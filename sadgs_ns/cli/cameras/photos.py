@@ -57,7 +57,7 @@ def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
         status = (folder / name).stat()
         return [status.st_size, status.st_mtime_ns, zlib.crc32((folder / name).read_bytes())]
 
-    with _threads() as pool:
+    with threads() as pool:
         return dict(zip(names, pool.map(stamp, names), strict=True))
 
 
@@ -86,7 +86,7 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
             why = reason(error)
         return f"{name} ({why})"
 
-    with _threads() as pool:
+    with threads() as pool:
         for done, found in enumerate(pool.map(read, names), 1):
             photos.append(found) if isinstance(found, Photo) else broken.append(found)
             report("photos", done, len(names))
@@ -103,9 +103,9 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
 
 
 @contextlib.contextmanager
-def _threads() -> Iterator[ThreadPoolExecutor]:
+def threads(number: int | None = None) -> Iterator[ThreadPoolExecutor]:
     """Make threads that drop their waiting work when the block raises, as at an interrupt."""
-    pool = ThreadPoolExecutor()
+    pool = ThreadPoolExecutor(number)
     try:
         yield pool
     finally:
@@ -184,7 +184,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
         except OSError:  # Some file systems hold no links.
             shutil.copyfile(source, target)
 
-    with _threads() as pool:
+    with threads() as pool:
         list(pool.map(convert, photos))
     partial.rename(converted)
     return converted, new

@@ -12,9 +12,11 @@ import itertools
 import json
 import shutil
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,20 +79,26 @@ def make_model(
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
-    with ThreadPoolExecutor(1) as pool:  # Features need no torch, whose import takes seconds, as that of nerfstudio.
-        gpu, nerfstudio = pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
-        if not model.exists():
-            extract(photos, groups, database, rigs)
-            match(names, database, matching, gpu.result(), rigs)
-            place_cameras(photos, names, database, model, base)
-        known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
-        made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
-        undistort(photos, model, made, max_size, known)
+    gpu, nerfstudio = begin_imports()
+    if not model.exists():
+        extract(photos, groups, database, rigs)
+        match(names, database, matching, gpu.result(), rigs)
+        place_cameras(photos, names, database, model, base)
+    known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
+    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+    undistort(photos, model, made, max_size, known)
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
         nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
     return summarize(names, made, database, matching, (model / "attempts.txt").read_text())
+
+
+@cache
+def begin_imports() -> tuple[Future[torch.device | None], Future[ModuleType]]:
+    """Begin the imports of torch and of nerfstudio's writer of scenes in a thread, because they take seconds."""
+    pool = ThreadPoolExecutor(1)
+    return pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
 
 
 def wake_gpu() -> torch.device | None:
@@ -178,11 +186,12 @@ def match(
             from sadgs_ns.cli.cameras.matching import write_matches
 
             write_matches(database, chunk, gpu)
-            pycolmap.geometric_verification(database, two_view_geometry_options=verification)
         else:
             pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
             pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
             pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+    if gpu is not None:  # It tries pairs again that did not fit, so all are verified together.
+        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     progress(stage, len(pairs), len(pairs))
 
 
