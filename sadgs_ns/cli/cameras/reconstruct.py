@@ -43,7 +43,7 @@ descriptors travel to the GPU."""
 _ADJUSTMENT = {
     "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
     "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
-    "ba_local_max_refinements": 1, "ba_global_max_refinements": 1,
+    "ba_local_max_refinements": 1, "ba_global_max_refinements": 2,
 }  # fmt: skip
 """Growth of a model until all of it is adjusted again, the relative change of the cost at which an adjustment ends, and
 how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5 (docs/results.md#finding-cameras)."""
