@@ -51,7 +51,7 @@ def scene_near_plane(
 ) -> float:
     """Derive the near plane of a scene, > 0, from the `nearest_depths` of its training cameras.
 
-    An object close to a single camera is drawn, too. `extent` is `initialization.camera_extent`.
+    The camera that is nearest to anything decides. `extent` is `initialization.camera_extent`.
     """
     nearest = float(depths.min())
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent

@@ -369,7 +369,7 @@ class SadgsTrainerConfig(TrainerConfig):
                 raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
 
     def _check_rates(self) -> None:
-        """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive and finite."""
+        """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive."""
         for group, configs in self.optimizers.items():
             adam, rate, scheduler = configs["optimizer"], configs["optimizer"].lr, configs.get("scheduler")
             ranges = [  # One launch updates all parameters.
