@@ -274,7 +274,7 @@ class PhotosToSplat:
             self._note(few=found)
             if not self.options.anyway:
                 line.update(found)
-                command = ["sadgs-process", str(self.source), str(self._scene), "--matching", "exhaustive"]
+                command += ["--matching", "exhaustive"]
                 again = f"or compare more pairs of them with `{shlex.join(command)}`, and run this command again; "
                 raise RunError(
                     f"only {found}, so the splat would show only what these saw: take more photos between the others, "

@@ -287,6 +287,16 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert "$ ns-train sadgs --data " in log.read_text("utf8")
 
 
+def test_the_command_that_compares_more_pairs_keeps_the_size(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    found = dataclasses.asdict(Summary(100, 30, 100, 0.5, {}, "similar"))
+    monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
+    monkeypatch.setattr(PhotosToSplat, "call", lambda *others: found)
+    assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply", "--max-size", "400"]) == 1
+    assert "/scene --max-size 400 --matching exhaustive`, and run" in capsys.readouterr().err
+
+
 @pytest.mark.hard_case(
     "`sadgs` with photos removed, other settings or options, another folder, no Node.js for a page or no "
     "libusb-1.0 for a mesh",
