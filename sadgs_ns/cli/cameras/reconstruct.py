@@ -1,7 +1,7 @@
 """The stages from photos to a scene: features, matches, cameras with points, and undistortion, all by pycolmap.
 
-Each stage goes on where an interrupted run left it. They run in a process of their own (`colmap.py`), so that no other
-module of the package may import this one.
+Each stage goes on where an interrupted run left it. They run in a process of their own, whose `colmap_process.py` alone
+may import this module.
 """
 
 from __future__ import annotations
