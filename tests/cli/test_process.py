@@ -571,7 +571,7 @@ def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
         image = Image.new("L", (256, 128), 255)
         image.paste(0, (0, 128 - height, 256, 128))  # what is below the horizon
         image.save(tmp_path / name)
-    panorama = Photo("pano.png", (256, 128), (), (), False, is_panorama=True)
+    panorama = Photo("pano.png", (256, 128), (), False, is_panorama=True)
     write_masks(tmp_path, {"pano.png": "mask.png"}, [panorama], panorama.views, tmp_path / "masks")
     white = [np.asarray(Image.open(tmp_path / "masks" / f"{view.name}.png")).mean() / 255 for view in panorama.views]
     assert min(white[:4]) > 0.6 and max(white[4:]) < 0.4 and len(white) == 8
