@@ -51,7 +51,7 @@ _TRAINING, _EXPORT = "sadgs_ns.training.start:train", "sadgs_ns.cli.exporting:ex
 _LOCK_SECONDS = 10.0
 """Time in which the last stage of a killed run may save."""
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
-"""Stage and part of the time that begin with each stage."""
+"""Stage and part of the time that begin with a stage, if others than itself."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
 _ON_CPU = (
     "torch finds no GPU on this machine, so training runs on the CPU, which is for small scenes: a GPU with CUDA is "
@@ -166,7 +166,7 @@ class PhotosToSplat:
             needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
             self._trainer = self.worker("training", _TRAINING) if needs_training else None
             for name, stage in STAGES.items():
-                self.timeline.begin(*_FIRST_PARTS[name])
+                self.timeline.begin(*_FIRST_PARTS.get(name, (name, name)))
                 with StatusLine(name, self.console) as line:
                     try:
                         line.update(stage(self, line))
