@@ -97,3 +97,29 @@ def test_no_more_photos_are_searched_at_a_time_than_memory_holds(features, monke
     assert features._num_threads([]) == 64
     monkeypatch.setattr(features, "available_host_bytes", lambda: 0.0)
     assert features._num_threads([(2000, 1500)]) == 1
+
+
+def test_photos_are_taken_by_lots_as_all_at_once(features, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A panorama's views may lie in two lots."""
+    import pycolmap
+
+    names = [f"{i}.png" for i in range(5)]
+    views = [f"pano/{i}.png" for i in range(features.VIEWS)]
+    (tmp_path / "pano").mkdir()
+    rng = np.random.default_rng(0)
+    for name in (*names, *views):
+        Image.fromarray(rng.integers(0, 256, (64, 64), np.uint8)).resize((128, 128)).save(tmp_path / name)
+    held = []
+    for at_once in (256, 3):
+        monkeypatch.setattr(features, "_AT_ONCE", at_once)
+        database = tmp_path / f"{at_once}.db"
+        features.extract(tmp_path, [names[:4], names[4:]], database, [views])
+        with pycolmap.Database.open(database) as opened:
+            images = {image.name: image for image in opened.read_all_images()}
+            cameras = [[images[name].camera_id for name in group] for group in (names[:4], names[4:])]
+            assert len({*cameras[0]}) == 1 and len({*cameras[0], *cameras[1]}) == 2
+            rigs = [rig.num_sensors() for rig in opened.read_all_rigs()]
+            held.append(
+                (sorted(rigs), {name: opened.read_keypoints(images[name].image_id).tolist() for name in images})
+            )
+    assert held[0] == held[1] and len(held[0][1]) == len(names) + len(views)

@@ -6,6 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,8 @@ _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 _BYTES_PER_PIXEL = 240
 """Memory of OpenCV for features, as measured; it doubles the photo's size first."""
+_AT_ONCE = 256
+"""Photos whose features are kept in memory, at 1 MB each, until COLMAP has read the photos and they are saved."""
 
 
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs: Sequence[Sequence[str]] = ()) -> None:
@@ -36,38 +39,47 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     names = list(itertools.chain(*groups, *rigs))
     progress("features", 0, len(names))
     with pycolmap.Database.open(database) as opened:
-        known = {image.name: image for image in opened.read_all_images()}
-        done_before = {name for name, image in known.items() if opened.exists_descriptors(image.image_id)}
-    searched = [name for name in names if name not in done_before]
+        done_before = {image.name for image in opened.read_all_images() if opened.exists_descriptors(image.image_id)}
+    searched, done = [name for name in names if name not in done_before], len(done_before)
     cv2.setNumThreads(1)  # Each thread of ours has a photo.
     with threads(_num_threads([_size(photos / name) for name in searched])) as pool:
-        masks = database.with_name("masks")
-        found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in searched}
-        for group in groups:  # Meanwhile COLMAP reads all photos, one after the other.
-            if missing := [name for name in group if name not in known]:
-                reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
-                # An interrupted run has made the camera.
-                reader.existing_camera_id = next((known[name].camera_id for name in group if name in known), -1)
-                pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
-        with pycolmap.Database.open(database) as opened:
-            for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP believes.
-                side = max(camera.width, camera.height)
-                if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
-                    camera.focal_length_x = camera.focal_length_y = 1.2 * side
-                    camera.has_prior_focal_length = False
-                    opened.update_camera(camera)
-            for views in (views for views in rigs if views[0] not in known):
-                with pycolmap.DatabaseTransaction(opened):
-                    _add_panorama(opened, photos, views)
-            done = len(done_before)
-            for image in (image for image in opened.read_all_images() if image.name in found):
-                keypoints, descriptors = found.pop(image.name).result()
-                features = pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=descriptors)
-                with pycolmap.DatabaseTransaction(opened):
-                    opened.write_keypoints(image.image_id, keypoints)
-                    opened.write_descriptors(image.image_id, features)
-                done += 1
-                progress("features", done, len(names))
+        for start in range(0, len(searched), _AT_ONCE):
+            lot, masks = searched[start : start + _AT_ONCE], database.with_name("masks")
+            found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in lot}
+            _add_images(database, photos, groups, rigs, {*lot})  # It takes a while, because COLMAP reads each photo.
+            with pycolmap.Database.open(database) as opened:
+                for image in (image for image in opened.read_all_images() if image.name in found):
+                    keypoints, descriptors = found.pop(image.name).result()
+                    features = pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=descriptors)
+                    with pycolmap.DatabaseTransaction(opened):
+                        opened.write_keypoints(image.image_id, keypoints)
+                        opened.write_descriptors(image.image_id, features)
+                    done += 1
+                    progress("features", done, len(names))
+
+
+def _add_images(
+    database: Path, photos: Path, groups: Sequence[Sequence[str]], rigs: Sequence[Sequence[str]], lot: AbstractSet[str]
+) -> None:
+    """Add the photos of a lot to COLMAP's database, and their cameras, as far as they are not there yet."""
+    with pycolmap.Database.open(database) as opened:
+        known = {image.name: image.camera_id for image in opened.read_all_images()}
+    for group in groups:
+        if missing := [name for name in group if name in lot and name not in known]:
+            reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
+            # An earlier lot or run has made the camera.
+            reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
+            pycolmap.import_images(database, photos, pycolmap.CameraMode.SINGLE, missing, reader)
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():  # EXIF may hold nonsense, which COLMAP believes.
+            side = max(camera.width, camera.height)
+            if not 0.1 < camera.mean_focal_length() / side < 10:  # These limits and the guess are COLMAP's own.
+                camera.focal_length_x = camera.focal_length_y = 1.2 * side
+                camera.has_prior_focal_length = False
+                opened.update_camera(camera)
+        for views in (views for views in rigs if lot & {*views} and views[0] not in known):
+            with pycolmap.DatabaseTransaction(opened):
+                _add_panorama(opened, photos, views)
 
 
 def _size(photo: Path) -> tuple[int, int]:
