@@ -6,7 +6,9 @@ comment `# needs a GPU` in a block marks those that it precedes, or whose line i
 
 from __future__ import annotations
 
+import functools
 import importlib
+import inspect
 import os
 import re
 import shlex
@@ -157,8 +159,10 @@ def understood(words: Sequence[str], lenient: bool = False) -> Any:
             action.required &= not lenient
         raise Parsed(parse_args(parser, *arguments))
 
-    def parse_type(*arguments: Any, **options: Any) -> None:
-        raise Parsed(cli(*arguments, **options))
+    def parse_type(kind: Any, *arguments: Any, **options: Any) -> None:
+        # tyro would call a function, and takes its signature from what is called in its place.
+        asked = functools.wraps(kind)(lambda *_, **__: None) if inspect.isfunction(kind) else kind
+        raise Parsed(cli(asked, *arguments, **options))
 
     main, argv = program(words)
     with pytest.MonkeyPatch.context() as patch, pytest.raises(Parsed) as parsed:
@@ -195,6 +199,12 @@ def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(c
     elif file:
         shown = words[1] if first == "make" else first
         assert shown in (CHECKOUT / file).read_text("utf8")
+
+
+def test_a_command_is_understood_without_being_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    understood(["python", "-m", "examples.drawn_scene.scene", "demo", "--width", "40"])
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_protocol_that_is_shown_is_one():
