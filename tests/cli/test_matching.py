@@ -99,8 +99,8 @@ def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp
         features.extract(tmp_path / "photos", [names], database)
         pairs = [(names[0], names[1]), (names[0], names[2]), (names[1], names[2])]
         if ours:
-            matching.write_matches(database, pairs, torch.device("cpu"))
-            matching.write_matches(database, pairs, torch.device("cpu"))  # There is nothing left to do.
+            matching.write_matches(database, pairs, torch.device("cpu"), "matches")
+            matching.write_matches(database, pairs, torch.device("cpu"), "matches")  # There is nothing left to do.
             pycolmap.geometric_verification(database)  # It takes names with spaces, as a list of pairs does not.
         else:
             pycolmap.match_exhaustive(database)

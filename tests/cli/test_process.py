@@ -832,7 +832,8 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     """The device is the CPU here, which goes the GPU's way."""
     calls: list[tuple] = []
     monkeypatch.setattr(
-        "sadgs_ns.cli.cameras.matching.write_matches", lambda database, pairs, device: calls.append((*pairs, device))
+        "sadgs_ns.cli.cameras.matching.write_matches",
+        lambda database, pairs, device, stage: calls.append((*pairs, device)),
     )
     monkeypatch.setattr(pycolmap, "geometric_verification", lambda database, **options: calls.append(("verified",)))
     device = torch.device("cpu")

@@ -17,6 +17,7 @@ from PIL import Image
 from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
 from sadgs_ns.cli.cameras.photos import threads
 from sadgs_ns.cli.cameras.plan import MAX_SIDE, searched_pixels
+from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 
@@ -42,7 +43,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
         done_before = {image.name for image in opened.read_all_images() if opened.exists_descriptors(image.image_id)}
     searched, done = [name for name in names if name not in done_before], len(done_before)
     cv2.setNumThreads(1)  # Each thread of ours has a photo.
-    with threads(_num_threads([_size(photos / name) for name in searched])) as pool:
+    with threads(_num_threads([image_size(photos / name) for name in searched])) as pool:
         for start in range(0, len(searched), _AT_ONCE):
             lot, masks = searched[start : start + _AT_ONCE], database.with_name("masks")
             found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in lot}
@@ -80,11 +81,6 @@ def _add_images(
         for views in (views for views in rigs if lot & {*views} and views[0] not in known):
             with pycolmap.DatabaseTransaction(opened):
                 _add_panorama(opened, photos, views)
-
-
-def _size(photo: Path) -> tuple[int, int]:
-    with Image.open(photo) as image:
-        return image.size
 
 
 def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str]) -> None:

@@ -18,13 +18,16 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sadgs_ns.cli.cameras.plan import NEIGHBORS
+from sadgs_ns.events import progress
 
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
 """Largest angle between matching descriptors in radians, and its largest ratio to the next best's; COLMAP's."""
 _LARGEST_FEATURES = 128
-"""Features of each photo by which it is compared with all others, at a thousandth of the work of matching them."""
+"""Features of each photo by which it is compared with all others; comparing all takes up to 4,096 times the work."""
 _COMPARED_AT_ONCE = 500
-"""Photos that one is compared with at a time, which takes some 50 MB."""
+"""Photos that one is compared with at a time, in some .1 GB."""
+_SAVED_AT_ONCE = 400
+"""Pairs whose matches are saved and reported together."""
 _KEPT_PHOTOS = 2000
 """Photos whose descriptors stay on the device, at 1 MB each."""
 
@@ -101,8 +104,11 @@ def similar_photos(database: Path, device: torch.device | None) -> list[tuple[st
     return [(images[i].name, images[j].name) for i, j in similar_pairs(largest, NEIGHBORS)]
 
 
-def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torch.device) -> None:
-    """Match pairs of photos that have no matches in COLMAP's database yet, and write those there, unverified."""
+def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torch.device, stage: str) -> None:
+    """Match pairs of photos that have no matches in COLMAP's database yet, and write those there, unverified.
+
+    The progress of the stage is reported.
+    """
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
 
@@ -110,8 +116,10 @@ def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torc
         def descriptors(image_id: int) -> Tensor:
             return torch.from_numpy(opened.read_descriptors(image_id).data.copy()).to(device)
 
-        with pycolmap.DatabaseTransaction(opened):
-            for one, other in ((ids[a], ids[b]) for a, b in pairs):
-                if not opened.exists_matches(one, other):
-                    found = match_descriptors(descriptors(one), descriptors(other))
-                    opened.write_matches(one, other, found.cpu().numpy().astype(np.uint32))
+        for start in range(0, len(pairs), _SAVED_AT_ONCE):
+            progress(stage, start, len(pairs))
+            with pycolmap.DatabaseTransaction(opened):
+                for one, other in ((ids[a], ids[b]) for a, b in pairs[start : start + _SAVED_AT_ONCE]):
+                    if not opened.exists_matches(one, other):
+                        found = match_descriptors(descriptors(one), descriptors(other))
+                        opened.write_matches(one, other, found.cpu().numpy().astype(np.uint32))

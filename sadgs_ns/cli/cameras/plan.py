@@ -51,7 +51,7 @@ def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:
 def searched_pixels(size: tuple[int, int]) -> float:
     """Return the number of pixels in which features of a photo of this width and height are searched."""
     width, height = size
-    return width * height * min(1.0, MAX_SIDE / max(width, height)) ** 2
+    return width * height * min(1.0, MAX_SIDE / max(width, height, 1)) ** 2
 
 
 def pairs_to_match(photos: int, matching: Matching, known: int = 0) -> int:

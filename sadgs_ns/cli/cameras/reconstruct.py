@@ -37,9 +37,8 @@ _SEED = 0
 _TRIALS = 2000
 """Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs with
 hardly anything in common, and find no more matches in the others."""
-_PAIRS, _PAIRS_ON_GPU = 50, 400
-"""Pairs of photos that are matched, saved and reported together; for each lot COLMAP starts its threads anew, and the
-descriptors travel to the GPU."""
+_PAIRS = 50
+"""Pairs of photos that COLMAP matches, saves and reports together; for each lot it starts its threads anew."""
 _ADJUSTMENT = {
     "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
     "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
@@ -178,20 +177,18 @@ def match(
         pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
     else:
         pairs = choose_pairs(names, rigs, matching)
-    at_once = _PAIRS_ON_GPU if gpu is not None else _PAIRS
-    for start in range(0, len(pairs), at_once):
-        progress(stage, start, len(pairs))
-        chunk = pairs[start : start + at_once]
-        if gpu is not None:
-            from sadgs_ns.cli.cameras.matching import write_matches
+    if gpu is not None:
+        from sadgs_ns.cli.cameras.matching import write_matches
 
-            write_matches(database, chunk, gpu)
-        else:
-            pair_list.write_text("".join(f"{a} {b}\n" for a, b in chunk), "utf8")
+        write_matches(database, pairs, gpu, stage)
+        # It tries pairs again that did not fit, so all are verified together.
+        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+    else:
+        for start in range(0, len(pairs), _PAIRS):
+            progress(stage, start, len(pairs))
+            pair_list.write_text("".join(f"{a} {b}\n" for a, b in pairs[start : start + _PAIRS]), "utf8")
             pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
             pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-    if gpu is not None:  # It tries pairs again that did not fit, so all are verified together.
-        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     progress(stage, len(pairs), len(pairs))
 
 
