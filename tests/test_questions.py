@@ -1,4 +1,4 @@
-"""The questions of newcomers in questions.yaml have their answers where the file says."""
+"""The questions of newcomers to the code and of users have their answers where questions.yaml and its twin say."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import pytest
 import yaml
 
 CHECKOUT = Path(__file__).parents[1]
-QUESTIONS = yaml.safe_load((CHECKOUT / "tests/questions.yaml").read_text("utf8"))
+QUESTIONS, OF_READERS = (
+    yaml.safe_load((CHECKOUT / f"tests/{name}.yaml").read_text("utf8")) for name in ("questions", "reader_questions")
+)
 
 
 def defined(nodes: list[ast.stmt]) -> Iterator[str]:
@@ -29,3 +31,11 @@ def test_what_answers_a_question_is_where_it_is_expected(asked: dict[str, str]):
     path = CHECKOUT / asked["file"]
     assert path.is_file(), asked["question"]
     assert asked["name"] in set(defined(ast.parse(path.read_text("utf8")).body)), asked["question"]
+
+
+@pytest.mark.parametrize(
+    "asked", [asked for asked in OF_READERS if "file" in asked], ids=lambda asked: asked["question"]
+)
+def test_a_document_answers_a_reader_s_question(asked: dict[str, str]):
+    text = " ".join((CHECKOUT / asked["file"]).read_text("utf8").split())
+    assert text.count(asked["phrase"]) == 1, asked["answer"]
