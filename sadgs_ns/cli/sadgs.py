@@ -48,8 +48,7 @@ from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
 _TRAINING, _EXPORT = "sadgs_ns.training.start:train", "sadgs_ns.cli.exporting:export_all"
-_LOCK_SECONDS = 10.0
-"""Time in which the last stage of a killed run may save."""
+_LOCK_SECONDS = 10.0  # Time in which the last stage of a killed run may save
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
 """Stage and part of the time that begin with a stage, if others than itself."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]

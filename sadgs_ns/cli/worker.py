@@ -30,12 +30,9 @@ from sadgs_ns.training.interrupts import Interrupted
 OnEvent = Callable[..., None]
 """Called with an event's name and, by keyword, its fields."""
 _POLL_SECONDS = 0.1
-_KEPT_BYTES = 65536
-"""Size of the end of a failed process's output that is searched for the reason."""
-_PROMPT = "$ "
-"""Stands before a command in a log."""
-_PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")
-"""Commands put this before the sentence of an error."""
+_KEPT_BYTES = 65536  # Size of the end of a failed process's output that is searched for the reason
+_PROMPT = "$ "  # Stands before a command in a log
+_PREFIX = re.compile(r"^(error|sadgs-[\w-]+): ")  # Commands put this before the sentence of an error
 
 
 class WorkerError(RunError):

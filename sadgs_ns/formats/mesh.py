@@ -29,8 +29,7 @@ _WIDEST_PIXEL = 4.0
 _RESOLUTION = 16  # Voxels along the edge of a block
 _BLOCKS = 1000  # Blocks with room at first, 82 MB; Open3D doubles that if it must
 _VIEWS = 3  # A surface needs so many views, or all where there are fewer
-_SMALLEST_SHARE = 0.01
-"""Connected components with fewer triangles than this share of the largest one's are left out."""
+_SMALLEST_SHARE = 0.01  # Connected components with fewer triangles than this share of the largest one's are left out
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,7 @@ SWITCH = "SADGS_TRITON"
 
 _forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
 """The answer of `use_triton`; None if the device decides."""
-_working: set[torch.device] = set()
-"""Devices on which a kernel has run."""
+_working: set[torch.device] = set()  # Devices on which a kernel has run
 _asked: Counter[torch.device] = Counter()
 """Number of questions to `available` about a device on which no kernel had run."""
 

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 
-_LANES = 1024
-"""Gaussians that one program handles."""
+_LANES = 1024  # Gaussians that one program handles
 
 
 @triton.jit(do_not_specialize=["n"])

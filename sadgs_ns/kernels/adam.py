@@ -8,8 +8,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 
-_BLOCK = 1024
-"""Numbers that one program updates."""
+_BLOCK = 1024  # Numbers that one program updates
 
 
 @triton.jit

@@ -16,8 +16,7 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
 from sadgs_ns.kernels.shared import load3, store3
 
-_LANES = 1024
-"""Pixels that one program handles."""
+_LANES = 1024  # Pixels that one program handles
 
 
 @triton.jit(do_not_specialize=["n"])

@@ -20,8 +20,7 @@ MAX_DEGREE = 3
 """Highest degree that the kernels know."""
 _LANES, _BACKWARD_LANES = 128, 32
 """Gaussians that one program handles, forward and backward, where each has four threads."""
-_VIEWS = 2
-"""Views whose gradients one launch sums in registers; more views take more launches."""
+_VIEWS = 2  # Views whose gradients one launch sums in registers; more views take more launches
 
 
 @triton.jit

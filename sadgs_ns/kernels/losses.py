@@ -18,12 +18,9 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
 from sadgs_ns.kernels.shared import load3, store3
 
-_STRIP = 256
-"""Numbers along the rows that one program handles."""
-_RUN, _COLUMNS = 8, 128
-"""Rows and columns of numbers that one program handles."""
-_LANES = 4096
-"""Partial sums that are added at once."""
+_STRIP = 256  # Numbers along the rows that one program handles
+_RUN, _COLUMNS = 8, 128  # Rows and columns of numbers that one program handles
+_LANES = 4096  # Partial sums that are added at once
 
 
 @triton.jit

@@ -20,8 +20,7 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, rotation, store3
 
-_LANES = 128
-"""Gaussians that one program handles."""
+_LANES = 128  # Gaussians that one program handles
 
 
 @triton.jit

@@ -10,8 +10,7 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import TINY, load3, store3
 
-_PIXELS = 1024
-"""Pixels that one program handles."""
+_PIXELS = 1024  # Pixels that one program handles
 
 
 @triton.jit

@@ -9,8 +9,7 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn
 
-_LANES = 256
-"""Gaussians that one program handles."""
+_LANES = 256  # Gaussians that one program handles
 
 
 @triton.jit

@@ -9,8 +9,7 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, load3, rotation, store3
 
-_LANES = 128
-"""Gaussians that one program handles."""
+_LANES = 128  # Gaussians that one program handles
 
 
 @triton.jit

@@ -15,8 +15,7 @@ from sadgs_ns.kernels.shared import TINY, load3, store3
 
 _TILES = {2: (16, 64), 3: (2, 512)}
 """Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
-_PIXELS = 1024
-"""Pixels that a program handles where no neighbours matter."""
+_PIXELS = 1024  # Pixels that a program handles where no neighbours matter
 
 
 @triton.jit(do_not_specialize=["height", "width", "taps"])

@@ -18,19 +18,16 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
 
-_LANES = 32
-"""Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others."""
+_LANES = 32  # Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others
 _FEW_PAIRS, _PART_PAIRS = 64, 256
 """Largest number of tiles of a Gaussian that one lane lists, and mean number of tiles of the parts into which a larger
 one is cut. One that reaches all tiles of an image would take a lane, or a program, longer than the rest of a step."""
-_PART_ROWS, _PART_COLUMNS = 4, 8
-"""Rows and columns of tiles that a program writes at once, of a part."""
+_PART_ROWS, _PART_COLUMNS = 4, 8  # Rows and columns of tiles that a program writes at once, of a part
 _PROGRAMS = 4096
 """Largest number of programs that share out the parts: as many as an H100 runs at once, of one warp each."""
 _PLACE = tl.constexpr(2**24)
 """Factor on a Gaussian's place in the order by depth, where it is noted with the number of one of its parts."""
-_ORDER_LANES = 512
-"""Pairs or tiles that one program handles where the lists are put in order."""
+_ORDER_LANES = 512  # Pairs or tiles that one program handles where the lists are put in order
 
 
 @triton.jit
@@ -252,8 +249,7 @@ class PairCounts:
 
     counts: Tensor
     """In the host's memory once `arrived` has happened; on the device while a CUDA graph is captured. int64 [C]"""
-    arrived: torch.cuda.Event | None
-    """None where the host need not wait."""
+    arrived: torch.cuda.Event | None  # None where the host need not wait
 
     @staticmethod
     def sent(counts: Tensor) -> PairCounts:
@@ -281,28 +277,20 @@ class TileLists(NamedTuple):
 
     starts: Tensor
     """Where each tile's list starts. int32 [C, tile rows, tile columns], with one more row of given length"""
-    ids: Tensor
-    """Indices in C · N that the lists hold, from front to back. int32 [number of pairs, or `capacity`]"""
-    overflowed: Tensor
-    """1 if the given length was too short, so that nothing is drawn, else 0. int64 [1]"""
+    ids: Tensor  # Indices in C · N that the lists hold, from front to back. int32 [number of pairs, or `capacity`]
+    overflowed: Tensor  # 1 if the given length was too short, so that nothing is drawn, else 0. int64 [1]
 
 
 @dataclass(frozen=True)
 class PendingTiles:
     """Tile lists whose length is on its way to the host, which may give the device other work meanwhile."""
 
-    ellipses: list[Tensor]
-    """means2d [C, N, 2], radii [C, N(, 2)], conics [C, N, 3] and opacities [C, N]."""
-    order: Tensor
-    """Indices in C · N of the Gaussians of all views, from front to back. int64 [C * N]"""
-    ends: Tensor
-    """Where the pairs of each Gaussian end, in this order. int64 [C * N]"""
-    pair_counts: PairCounts
-    """Their number in each view, whose sum is the last of `ends`."""
-    tile_size: int
-    """px."""
-    tile_counts: tuple[int, int, int]
-    """Numbers of views, and of rows and columns of tiles in each."""
+    ellipses: list[Tensor]  # means2d [C, N, 2], radii [C, N(, 2)], conics [C, N, 3] and opacities [C, N]
+    order: Tensor  # Indices in C · N of the Gaussians of all views, from front to back. int64 [C * N]
+    ends: Tensor  # Where the pairs of each Gaussian end, in this order. int64 [C * N]
+    pair_counts: PairCounts  # Their number in each view, whose sum is the last of `ends`
+    tile_size: int  # px
+    tile_counts: tuple[int, int, int]  # Numbers of views, and of rows and columns of tiles in each
 
     @torch.no_grad()
     def lists(self, capacity: int | None = None) -> TileLists:

@@ -27,30 +27,21 @@ NEIGHBOURS = 4
 """A path leads from each camera to so many of the others, the nearest that look in a similar direction."""
 SIMILAR_DEGREES = 60.0
 """Largest angle between the viewing axes of two cameras with a path between them."""
-_CELLS = 32
-"""Cells on each side of a grid that tells which Gaussians may be near a path."""
-_PAIRS = 2**21
-"""Pairs of a point and a path that are computed at a time, in arrays of 25 MB."""
+_CELLS = 32  # Cells on each side of a grid that tells which Gaussians may be near a path
+_PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
 
 
 @dataclass(frozen=True)
 class CameraPaths:
     """E straight paths between cameras, and the points of surfaces near them."""
 
-    starts: Tensor
-    """World units. [E, 3]"""
-    ends: Tensor
-    """World units. [E, 3]"""
-    reach: float
-    """Distance up to which the space around the paths is empty, in world units."""
-    points: Tensor
-    """Points of surfaces that may be near enough to count. [P, 3]"""
-    corner: Tensor
-    """Smallest coordinates of a grid around the paths. [3]"""
-    cell: float
-    """Side of its cells, which are cubes."""
-    near: Tensor
-    """Which of its cells reach into the empty space. bool [32, 32, 32]"""
+    starts: Tensor  # World units. [E, 3]
+    ends: Tensor  # World units. [E, 3]
+    reach: float  # Distance up to which the space around the paths is empty, in world units
+    points: Tensor  # Points of surfaces that may be near enough to count. [P, 3]
+    corner: Tensor  # Smallest coordinates of a grid around the paths. [3]
+    cell: float  # Side of its cells, which are cubes
+    near: Tensor  # Which of its cells reach into the empty space. bool [32, 32, 32]
 
     @staticmethod
     def of(

@@ -24,12 +24,10 @@ _SEEN = 1 / 255
 class Cleaning:
     """Which Gaussians are taken away; by default none."""
 
-    min_views: int = 0
-    """Take away Gaussians that fewer training views see; 0 takes none."""
+    min_views: int = 0  # Take away Gaussians that fewer training views see; 0 takes none
     max_extent: float | None = None
     """Take away Gaussians whose longest standard deviation is more than this, in world units; None takes none."""
-    crop: Box | None = None
-    """Take away Gaussians whose centre is outside this box, in world units; None takes none."""
+    crop: Box | None = None  # Take away Gaussians whose centre is outside this box, in world units; None takes none
     dust: float = 0.0
     """Take away Gaussians that make up less than this, in pixels, of the image of every training view; 0 takes none."""
 
@@ -58,12 +56,9 @@ class Cleaning:
 class Visibility:
     """How much of N Gaussians the training views see."""
 
-    views: Tensor
-    """Number of views that see each. int64 [N]"""
-    pixels: Tensor
-    """How many pixels each makes up in the view where these are most. [N]"""
-    total: int
-    """Number of views."""
+    views: Tensor  # Number of views that see each. int64 [N]
+    pixels: Tensor  # How many pixels each makes up in the view where these are most. [N]
+    total: int  # Number of views
 
 
 def measure_visibility(

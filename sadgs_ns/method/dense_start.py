@@ -27,19 +27,15 @@ DEPTH_TOLERANCE = 0.02
 """Largest relative difference of depths that agree."""
 SCALE = 0.5
 """Largest standard deviation of a point, in wavelengths: its η is 1/2."""
-_DRAWN = 4
-"""Points that are drawn for each one that is wanted, because many do not stay."""
+_DRAWN = 4  # Points that are drawn for each one that is wanted, because many do not stay
 
 
 class DensePoints(NamedTuple):
     """N points on surfaces."""
 
-    means: Tensor
-    """World units. [N, 3]"""
-    colors: Tensor
-    """Mean over the views that agree, in [0, 1]. [N, 3]"""
-    scales: Tensor
-    """Half a wavelength, but at least half a pixel of the depth map, in world units. [N]"""
+    means: Tensor  # World units. [N, 3]
+    colors: Tensor  # Mean over the views that agree, in [0, 1]. [N, 3]
+    scales: Tensor  # Half a wavelength, but at least half a pixel of the depth map, in world units. [N]
 
 
 @torch.no_grad()

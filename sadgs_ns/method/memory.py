@@ -59,10 +59,8 @@ PAIRS_PER_GAUSSIAN = 12
 class StepSize:
     """The size of a step, besides the number of Gaussians."""
 
-    views: int = 0
-    """Number of views."""
-    pixels: int = 0
-    """Number of pixels of all views."""
+    views: int = 0  # Number of views
+    pixels: int = 0  # Number of pixels of all views
     pairs: float = 0
     """Number of pairs of a Gaussian and a tile that it reaches, in all views, with the places of tile lists that a step
     left unused because their length was foreseen (render/tile_forecast.py)."""

@@ -20,10 +20,8 @@ NEAR_SHARE = 0.5
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""
 UNKNOWN_SHARE = 0.01
 """The near plane where no view sees enough SfM points, as a share of the cameras' extent."""
-_MOST_POINTS = 2**17
-"""Of more points, so many are looked at, since a point in each of thousands of views takes time."""
-_PAIRS = 2**24
-"""Pairs of a pose and a point that are computed at a time, in arrays of 64 MB."""
+_MOST_POINTS = 2**17  # Of more points, so many are looked at, since a point in each of thousands of views takes time
+_PAIRS = 2**24  # Pairs of a pose and a point that are computed at a time, in arrays of 64 MB
 
 
 def nearest_depths(

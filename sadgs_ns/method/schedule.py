@@ -28,8 +28,7 @@ DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
 """Iterations of the shortest run that resets opacities: shorter ones lost 2.7 to 11 dB (docs/results.md#short-runs)."""
-_PARTS = 30
-"""A run is divided into so many parts of as many whole iterations."""
+_PARTS = 30  # A run is divided into so many parts of as many whole iterations
 _WINDOWS = {
     "structure_every": 5,
     "absgs_every": 1,

@@ -43,30 +43,22 @@ DEPTH_TOLERANCE = 0.01
 PIXEL_TOLERANCE = 1.0
 """Depths agree if a pixel's own takes it to a neighbour, and the neighbour's takes it back to within this many px."""
 
-_POINTS = 2000
-"""Most SfM points that are used. Neighbours and ranges are sums and quantiles, which need no more."""
-_TRIPLES = 2**22
-"""Triples of two views and a point that are computed at a time, in arrays of 32 to 100 MB."""
+_POINTS = 2000  # Most SfM points that are used. Neighbours and ranges are sums and quantiles, which need no more
+_TRIPLES = 2**22  # Triples of two views and a point that are computed at a time, in arrays of 32 to 100 MB
 _BEST_ANGLES = (5.0, 15.0)
 """Degrees between the rays of two cameras to a point, between which depth is accurate and windows look alike."""
-_WIDEST_ANGLE = 35.0
-"""Degrees from which on windows look too different to be compared."""
-_SHARE = 0.02
-"""A neighbour is usable if its weight is at least this share of the points that the view sees."""
-_TINY = 1e-6
-"""Keeps quotients finite. A point behind a camera is projected far outside its picture."""
+_WIDEST_ANGLE = 35.0  # Degrees from which on windows look too different to be compared
+_SHARE = 0.02  # A neighbour is usable if its weight is at least this share of the points that the view sees
+_TINY = 1e-6  # Keeps quotients finite. A point behind a camera is projected far outside its picture
 
 
 @dataclass(frozen=True)
 class DepthMap:
     """Depth of one view."""
 
-    depth: Tensor
-    """Along the viewing axis, in world units; 0 where it is unknown. [h, w]"""
-    confidence: Tensor
-    """In [0, 1]; 0 where the depth is unknown. [h, w]"""
-    K: Tensor
-    """Intrinsics in px at this size; the centre of the first pixel is (0.5, 0.5). [3, 3]"""
+    depth: Tensor  # Along the viewing axis, in world units; 0 where it is unknown. [h, w]
+    confidence: Tensor  # In [0, 1]; 0 where the depth is unknown. [h, w]
+    K: Tensor  # Intrinsics in px at this size; the centre of the first pixel is (0.5, 0.5). [3, 3]
 
 
 @dataclass(frozen=True)
@@ -76,12 +68,9 @@ class _View:
     levels: list[Tensor]
     """Grey value around 0, and 1 where it is valid; both are 0 elsewhere. From fine to coarse. Each [2, h, w]"""
     neighbours: list[int]
-    to: Tensor
-    """(x, y, 1, inverse depth) → homogeneous place in each neighbour, as `_project` uses it. [N, 3, 4]"""
-    back: Tensor
-    """The same from each neighbour to this view. [N, 3, 4]"""
-    inverse: tuple[float, float]
-    """Smallest and largest inverse depth."""
+    to: Tensor  # (x, y, 1, inverse depth) → homogeneous place in each neighbour, as `_project` uses it. [N, 3, 4]
+    back: Tensor  # The same from each neighbour to this view. [N, 3, 4]
+    inverse: tuple[float, float]  # Smallest and largest inverse depth
     step: float
     """Inverse depth that moves a pixel by about 1 px at working size in the neighbour with the longest baseline."""
 

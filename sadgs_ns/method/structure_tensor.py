@@ -173,8 +173,7 @@ class _WeightedSums:
     Outside the image there are zeros, which weigh nothing.
     """
 
-    weight: Tensor
-    """1 at valid pixels and 0 at masked ones [B, 1, H, W], or [1, 1, H, W] of ones without masks."""
+    weight: Tensor  # 1 at valid pixels and 0 at masked ones [B, 1, H, W], or [1, 1, H, W] of ones without masks
     masked: bool
     correlate: Callable[[Tensor, Tensor, int], Tensor]
 

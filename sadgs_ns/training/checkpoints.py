@@ -17,10 +17,8 @@ from sadgs_ns.files import atomic_path
 from sadgs_ns.training.progress import warn
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
-_FOLDER = "nerfstudio_models"
-"""Name of the folder of checkpoints in a run's folder."""
-_PARTS = ("step", "pipeline", "optimizers", "scalers")
-"""Keys of every checkpoint of nerfstudio's trainer."""
+_FOLDER = "nerfstudio_models"  # Name of the folder of checkpoints in a run's folder
+_PARTS = ("step", "pipeline", "optimizers", "scalers")  # Keys of every checkpoint of nerfstudio's trainer
 
 
 def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]:

@@ -17,8 +17,7 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.stages import KernelChoice, Stages
 
-_PATIENCE = 2.0
-"""Seconds after which the user is told what the run is waiting for."""
+_PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting for
 
 
 def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:

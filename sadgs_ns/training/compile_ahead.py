@@ -24,10 +24,8 @@ from typing import Any
 
 from sadgs_ns.events import progress
 
-_FEWEST_CORES = 3
-"""Two are busy with the run itself."""
-_LONGEST = 60.0
-"""Seconds without another kernel after which the run goes on alone."""
+_FEWEST_CORES = 3  # Two are busy with the run itself
+_LONGEST = 60.0  # Seconds without another kernel after which the run goes on alone
 _HERE, _CARDS = Path(__file__).parent, Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
 _found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options of each kernel, for forked processes

@@ -41,8 +41,7 @@ DEFERRED: dict[str, tuple[str, ...]] = {
 class StandIn(ModuleType):
     """Stands for a module, for what it holds, or for what a call returns, until that is read or called."""
 
-    importing = False
-    """Whether nerfstudio is being imported, which asks for names, and needs none of them yet."""
+    importing = False  # Whether nerfstudio is being imported, which asks for names, and needs none of them yet
 
     def __init__(self, name: str, find: Callable[[], Any]) -> None:
         super().__init__(name)

@@ -14,8 +14,7 @@ from typing import Any
 
 from rich.console import Console
 
-_HANG_UP_SECONDS = 2.0
-"""Longest time from a write that fails because the terminal is gone until its signal comes."""
+_HANG_UP_SECONDS = 2.0  # Longest time from a write that fails because the terminal is gone until its signal comes
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a run to stop. The last one is that of a terminal that is gone, as when ssh is cut off."""
 

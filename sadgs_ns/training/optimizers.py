@@ -19,8 +19,7 @@ from sadgs_ns.kernels import use_triton
 from sadgs_ns.training.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 from sadgs_ns.training.options import hide
 
-_ONE = torch.tensor(1.0, device="cpu")
-"""The host adds this to a count of steps in a third of the time for Python's 1."""
+_ONE = torch.tensor(1.0, device="cpu")  # The host adds this to a count of steps in a third of the time for Python's 1
 
 
 class FusedAdam(Adam):

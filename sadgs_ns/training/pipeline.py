@@ -35,10 +35,8 @@ from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
-_NAMED_STEPS = 5
-"""Number of iterations whose images a report of losses that are not finite names."""
-_SAMPLED = 1000
-"""About so many cameras, and Gaussians, are enough to find out whether training can see anything."""
+_NAMED_STEPS = 5  # Number of iterations whose images a report of losses that are not finite names
+_SAMPLED = 1000  # About so many cameras, and Gaussians, are enough to find out whether training can see anything
 
 
 class SadgsPipeline(VanillaPipeline):

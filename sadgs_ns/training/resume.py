@@ -23,8 +23,7 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 
-_SAME_PLACE = 1e-3
-"""Share of the cameras' extent up to which two cameras are taken for one."""
+_SAME_PLACE = 1e-3  # Share of the cameras' extent up to which two cameras are taken for one
 
 
 @dataclass

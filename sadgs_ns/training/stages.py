@@ -21,8 +21,7 @@ from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.nonfinite import MAX_GRADIENT
 
-_GAUSSIANS, _SIZE = 64, 64
-"""Number of Gaussians, and width and height in px, with which the kernels are tried."""
+_GAUSSIANS, _SIZE = 64, 64  # Number of Gaussians, and width and height in px, with which the kernels are tried
 _DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
 
 
@@ -31,16 +30,12 @@ class KernelChoice:
     """What decides which kernels a run launches, and how they are specialised; the defaults are the method's."""
 
     device: torch.device
-    views: int = 2
-    """Views of a step."""
+    views: int = 2  # Views of a step
     sh_degree: int = 3
-    is_black: bool = True
-    """Whether nothing is drawn behind the Gaussians."""
+    is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
-    alone: bool = True
-    """Whether one device holds all Gaussians."""
-    size: tuple[int, int] = (_SIZE, _SIZE)
-    """Largest width and height of the images, in px."""
+    alone: bool = True  # Whether one device holds all Gaussians
+    size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING
     """With the backend that draws, and a near plane in front of the Gaussians that are tried."""
     updates: tuple[tuple[tuple[int, ...], ...], ...] = (((3,), (15, 3), (3,), (1,), (4,), (3,)),)

@@ -43,8 +43,7 @@ _LESS_MEMORY = (
 )
 _ANOTHER_ENDED = "Another process of the run ended, and this one with it"
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-_SAVING_SHARE = 0.01
-"""Largest share of the time between two checkpoints by the clock that saving may take."""
+_SAVING_SHARE = 0.01  # Largest share of the time between two checkpoints by the clock that saving may take
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:

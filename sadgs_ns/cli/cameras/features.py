@@ -25,8 +25,7 @@ MOST_FEATURES = 8192
 """Most features of a photo, those with the most contrast; COLMAP's own limit."""
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
-_BYTES_PER_PIXEL = 240
-"""Memory of OpenCV for features, as measured; it doubles the photo's size first."""
+_BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
 _AT_ONCE = 256
 """Photos whose features are kept in memory, at 1 MB each, until COLMAP has read the photos and they are saved."""
 

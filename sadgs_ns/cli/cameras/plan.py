@@ -11,8 +11,7 @@ NEIGHBORS = 20
 """Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)."""
 MAX_SIDE = 3200
 """Longest side in px to which photos are scaled down to find features, as COLMAP does."""
-_PAIRS_PER_PHOTO = {"sequential": 16, "similar": NEIGHBORS}
-"""Other photos that each photo is matched with, at most."""
+_PAIRS_PER_PHOTO = {"sequential": 16, "similar": NEIGHBORS}  # Other photos that each photo is matched with, at most
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 
 

@@ -37,8 +37,7 @@ _SEED = 0
 _TRIALS = 2000
 """Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs with
 hardly anything in common, and find no more matches in the others."""
-_PAIRS = 50
-"""Pairs of photos that COLMAP matches, saves and reports together; for each lot it starts its threads anew."""
+_PAIRS = 50  # Pairs of photos that COLMAP matches, saves and reports together; for each lot it starts its threads anew
 _ADJUSTMENT = {
     "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
     "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
@@ -46,8 +45,7 @@ _ADJUSTMENT = {
 }  # fmt: skip
 """Growth of a model until all of it is adjusted again, the relative change of the cost at which an adjustment ends, and
 how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5 (docs/results.md#finding-cameras)."""
-_ADJUSTED_PHOTOS = 2
-"""Photos that are adjusted after each that is placed; COLMAP's own are 6."""
+_ADJUSTED_PHOTOS = 2  # Photos that are adjusted after each that is placed; COLMAP's own are 6
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
