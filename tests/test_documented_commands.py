@@ -32,7 +32,7 @@ from benchmarks import protocol
 from examples.drawn_scene.scene import write_scene
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-OTHER_LANGUAGES = {"python", "yaml", "diff", "{button-link}"}
+OTHER_LANGUAGES = {"python", "yaml", "{button-link}"}
 """Of fenced blocks that hold no commands."""
 FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-install-cli", "apt install")
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""
