@@ -37,7 +37,7 @@ KILL_SECONDS = 40.0
 sessions of their own, after 30 s."""
 
 COMMANDS = {
-    "table": ("table:Command", "the table of a results file, and plots of quality against time and Gaussians"),
+    "table": ("table:Command", "the table of a results file, and a plot of quality against time"),
     "views": ("view_table:Command", "the PSNR of each held-out view, and where it collapses"),
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
@@ -184,7 +184,7 @@ class Benchmark:
     gate: Path | None = None
     """baseline in JSON: exit with 1 if results are worse"""
     reference: str | None = None
-    """label of the row whose loop seconds are 1 in the column Ratio"""
+    """label of the row that the columns Ratio and Matched compare with"""
 
     def selected(self) -> list[Job]:
         """The protocol's jobs that are asked for, all checked before the first one runs."""

@@ -25,11 +25,13 @@ import yaml
 from tyro.conf import Positional
 
 from benchmarks import table
-from benchmarks.table import Run
+from benchmarks.table import Change, Run
 from sadgs_ns.files import atomic_path
 
 RESULTS, FIGURES, TABLES = Path("docs", "results"), Path("docs", "figures"), "tables.yaml"
 """Folders of the rows and of the figures in a checkout, and the name of the description among the rows."""
+Scenes = Sequence[str] | Mapping[str, Sequence[str]]
+"""Scenes, or names with the scenes that each is the mean of, as those of a capture that hold out other views."""
 _MARKED = re.compile(r"^<!-- table: (\S+) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
 _OPENED = re.compile(r"^<!-- (?:table: \S+|end) -->$", re.MULTILINE)
 
@@ -54,20 +56,39 @@ class Source:
             rows += map(json.loads, path.read_text("utf-8").splitlines())
         return rows
 
-    def lines(
-        self, rows: str, scenes: Sequence[str], labels: Mapping[str, str], reference: str | None = None
-    ) -> list[Run]:
-        """Of each scene a run for each label; `reference` is the label whose loop seconds there are 1."""
+    def lines(self, rows: str, scenes: Scenes, labels: Mapping[str, str], reference: str | None = None) -> list[Run]:
+        """Of each scene, or capture with folds, a run for each label; the others are compared with `reference`."""
         found, runs = table.groups(self.read(rows)), []
-        for scene in scenes:
-            base = [] if reference is None else table.group_of(found, scene, reference)
+        for scene, folds in folds_of(scenes).items():
+            base = [] if reference is None else [table.group_of(found, fold, reference) for fold in folds]
             for label, name in labels.items():
-                runs.append(Run(scene, name, table.group_of(found, scene, label), base, self.megapixels.get(scene)))
+                cell = [table.group_of(found, fold, label) for fold in folds]
+                runs.append(Run(scene, name, cell, base, self.megapixels.get(scene)))
         return runs
 
     def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]]) -> str:
         """A run a line."""
         return table.of_runs((run for line in lines for run in self.lines(**line)), columns)
+
+    def change(
+        self,
+        texts: Sequence[str],
+        remark: str,
+        rows: Sequence[str] = (),
+        change: tuple[str, str] = ("", ""),
+        scenes: Scenes = (),
+    ) -> Change:
+        """What changing from one label to another does to scenes, or to captures with folds."""
+        found = table.groups(self.read(*rows))
+        old, new = (
+            [[table.group_of(found, fold, label) for fold in folds] for folds in folds_of(scenes).values()]
+            for label in change
+        )
+        return Change(texts, old, new, remark)
+
+    def changes(self, header: Sequence[str], remark: str, lines: Sequence[Mapping[str, Any]]) -> str:
+        """A change a line."""
+        return table.of_changes((self.change(**line) for line in lines), header, remark)
 
     def sweep(self, rows: Sequence[str], labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
         """A setting a line."""
@@ -78,21 +99,20 @@ class Source:
         found = {r["variant"]: r for r in self.read(rows) if (r["table"], r["input"]) == (of, input)}
         return table.of_approximations([found[name] for name in variants or found])
 
-    def growth(self, rows: str) -> str:
-        """Milliseconds of a step by Gaussians and by pixels."""
-        return table.of_growth(self.read(rows))
-
-    def peers_drawn(
-        self, cost: str, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()
-    ) -> list[Any]:
+    def peers_drawn(self, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()) -> list[Any]:
         """Arguments of `plots.peers`."""
         runs = [(run, True) for line in lines for run in self.lines(**line)]
         runs += [(run, False) for line in elsewhere for run in self.lines(**line)]
-        return [[(run.name, here, *map(run.mean, (cost, "psnr", "lpips"))) for run, here in runs], cost]
+        return [[(run.name, here, *map(run.mean, ("loop_seconds", "psnr", "lpips"))) for run, here in runs]]
 
-    def quality_drawn(self, rows: str, cost: str) -> list[Any]:
+    def quality_drawn(self, rows: str) -> list[Any]:
         """Arguments of `plots.quality`."""
-        return [list(table.groups(self.read(rows)).items()), cost]
+        return [list(table.groups(self.read(rows)).items())]
+
+
+def folds_of(scenes: Scenes) -> Mapping[str, Sequence[str]]:
+    """Names with the scenes that each is the mean of."""
+    return scenes if isinstance(scenes, Mapping) else {scene: [scene] for scene in scenes}
 
 
 def made(source: Source, what: str, name: str, description: Any) -> Any:

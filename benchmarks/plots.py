@@ -1,4 +1,4 @@
-"""Plots of a benchmark's results: quality against time and against the number of Gaussians.
+"""Plots of a benchmark's results: quality against time.
 
 Every method has a colour (Okabe–Ito) and a marker of its own on all plots, so that none needs the colour. 7.2 in wide
 with text of 8 pt and more: true to size on a page of A4 or letter.
@@ -26,8 +26,6 @@ from benchmarks.table import mean
 
 METRICS = {"psnr": ("PSNR [dB]", True), "ssim": ("SSIM", True), "lpips": ("LPIPS", False)}
 """Axis title, and whether higher is better."""
-COSTS = {"loop_seconds": "Training loop [s]   ({})", "gaussians": "Gaussians   (← fewer is better)"}
-"""Fields that quality is drawn against, with the title of their axis."""
 
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#56B4E9", "#E69F00")  # yellow is too light
 _MARKERS = "os^DvPX*<>ph"
@@ -46,7 +44,6 @@ _RC: Any = {
     "figure.constrained_layout.use": True,
     "text.parse_math": False,  # a label may hold dollars
 }
-_FRONT: dict[str, Any] = {"color": _GREY, "linewidth": 1.0, "drawstyle": "steps-post", "zorder": 1}
 _styled = matplotlib.rc_context(_RC)
 
 Points = list[tuple[float, float]]
@@ -59,62 +56,44 @@ def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
     return {label: {"color": color, "marker": marker} for label, (color, marker) in named}
 
 
-def pareto_front(points: Iterable[tuple[float, float]], higher_is_better: bool) -> Points:
-    """The points (cost, quality), by rising cost, that no other beats: none costs as little with better quality."""
-    sign = 1 if higher_is_better else -1
-    front: Points = []
-    for cost, quality in sorted(points, key=lambda point: (point[0], -sign * point[1])):
-        if not front or sign * quality > sign * front[-1][1]:
-            front.append((cost, quality))
-    return front
-
-
 @_styled
-def quality(results: Iterable[tuple[tuple[str, str], list[Result]]], cost: str) -> Figure:
-    """PSNR, SSIM and LPIPS of scenes and labels against a field of COSTS, a row of panels a scene.
+def quality(results: Iterable[tuple[tuple[str, str], list[Result]]]) -> Figure:
+    """PSNR, SSIM and LPIPS of scenes and labels against loop seconds, a row of panels a scene.
 
-    Against seconds, runs that were measured on their way have lines; against Gaussians there is the Pareto front.
+    Runs that were measured on their way have lines.
     """
-    groups, timed = dict(results), cost == "loop_seconds"
+    groups = dict(results)
     scenes = list(dict.fromkeys(scene for scene, _ in groups))
     looks = styles(label for _, label in groups)
     figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.6))
     grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
     for (scene, metric), axes in zip(itertools.product(scenes, METRICS), grid.flat, strict=True):
         here = [(label, group) for (where, label), group in groups.items() if where == scene]
-        ends = {label: _known([(mean(group, cost), mean(group, metric))]) for label, group in here}
+        ends = {label: _known([(mean(group, "loop_seconds"), mean(group, metric))]) for label, group in here}
         for label, group in here:
-            seeds = _known([(row.get(cost), row.get(metric)) for row in group])
+            seeds = _known([(row.get("loop_seconds"), row.get(metric)) for row in group])
             if len(group) > 1:
                 _plot(axes, seeds, **looks[label], alpha=0.4, markersize=3.5, linestyle="")
             _plot(axes, ends[label], **looks[label], linestyle="", zorder=3)
-            if timed:
-                curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
-                _plot(axes, curve, **looks[label], markersize=3.5)
+            curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
+            _plot(axes, curve, **looks[label], markersize=3.5)
         _finish(axes, metric)
-        front = [] if timed else pareto_front(itertools.chain(*ends.values()), METRICS[metric][1])
-        if front:
-            worst, right = axes.get_ylim()[0 if METRICS[metric][1] else 1], axes.get_xlim()[1]
-            steps = [(front[0][0], worst), *front, (right, front[-1][1])]
-            axes.plot(*zip(*steps, strict=True), **_FRONT, scalex=False, scaley=False)
         if metric == "psnr":
             axes.set_title(scene)
     rows = [row for group in groups.values() for row in group]
-    line = "-" if timed and any(row.get("curve") for row in rows) else ""
+    line = "-" if any(row.get("curve") for row in rows) else ""
     handles = [Line2D([], [], **look, linestyle=line, label=label) for label, look in looks.items()]
-    handles += [] if timed else [Line2D([], [], **_FRONT, label="Pareto front of the means")]
     shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows)
-    remark = "runs shared a GPU: times are not comparable" if shared else "← less is better"
-    _finish_figure(figure, COSTS[cost].format(remark), handles)
+    _finish_figure(figure, "runs shared a GPU: times are not comparable" if shared else "← less is better", handles)
     return figure
 
 
 @_styled
-def peers(points: Sequence[tuple[str, bool, float, float, float]], cost: str) -> Figure:
-    """PSNR and LPIPS against a field of COSTS, each point with its name.
+def peers(points: Sequence[tuple[str, bool, float, float, float]]) -> Figure:
+    """PSNR and LPIPS against loop seconds, each point with its name.
 
     Points are a name that begins with the method's, whether it ran on the machine that most share (the others are
-    hollow), cost, PSNR and LPIPS.
+    hollow), seconds, PSNR and LPIPS.
     """
     figure = Figure(figsize=(_WIDTH, 3.0))
     methods = [name.split()[0].rstrip(",") for name, *_ in points]
@@ -129,7 +108,7 @@ def peers(points: Sequence[tuple[str, bool, float, float, float]], cost: str) ->
     handles = [Line2D([], [], **grey, label="on one machine")]
     if not all(here for _, here, *_ in points):
         handles.append(Line2D([], [], **grey, fillstyle="none", label="on other machines"))
-    _finish_figure(figure, COSTS[cost].format("← less is better"), handles)
+    _finish_figure(figure, "← less is better", handles)
     figure.draw_without_rendering()  # The panels then have their places, which names must not change.
     for axes, _, column in panels:
         _name_points(axes, [(point[0], point[2], point[column]) for point in points])  # type: ignore[misc]
@@ -220,9 +199,9 @@ def _finish(axes: Axes, metric: str) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def _finish_figure(figure: Figure, title: str, handles: Sequence[Line2D]) -> None:
-    """The title of x below all panels, and a legend above them."""
-    figure.supxlabel(title)
+def _finish_figure(figure: Figure, remark: str, handles: Sequence[Line2D]) -> None:
+    """The title of x, with a remark, below all panels, and a legend above them."""
+    figure.supxlabel(f"Training loop [s]   ({remark})")
     figure.align_ylabels()
     # The texts are set afterwards: matplotlib would leave labels out that start with an underscore.
     names = [str(i) for i in range(len(handles))]

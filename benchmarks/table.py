@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +58,8 @@ def groups(rows: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
 
 
 def values(group: Iterable[Result], name: str) -> list[float]:
-    """A field, `phases.loss` being one of a field's, of the results that have it."""
-    field, _, inner = name.partition(".")
-    found = [(row.get(field) or {}).get(inner) if inner else row.get(field) for row in group]
-    return [value for value in found if value is not None]
+    """A field of the results that have it."""
+    return [value for row in group if (value := row.get(name)) is not None]
 
 
 def mean(group: Iterable[Result], name: str) -> float | None:
@@ -68,10 +68,37 @@ def mean(group: Iterable[Result], name: str) -> float | None:
     return sum(known) / len(known) if known else None
 
 
-def half_range(group: Iterable[Result], name: str) -> float:
-    """Half the range of a field over the results that have it, of which there must be one."""
-    known = values(group, name)
-    return (max(known) - min(known)) / 2
+Cell = Sequence[Sequence[Result]]
+"""The runs of each scene that a cell of a table stands for, one a seed; a capture's folds are several scenes."""
+
+
+def mean_over_scenes(cell: Cell, name: str) -> float | None:
+    """Mean over scenes of the means over seeds; None if a scene has no number."""
+    known = [value for group in cell if (value := mean(group, name)) is not None]
+    return sum(known) / len(known) if known and len(known) == len(cell) else None
+
+
+def deviation(cell: Cell, name: str) -> float | None:
+    """Pooled standard deviation over the seeds of all scenes; None if these say less than three seeds of one scene."""
+    known = [numbers for group in cell if len(numbers := values(group, name)) > 1]
+    freedom = sum(len(numbers) - 1 for numbers in known)
+    if freedom < 2:
+        return None
+    return math.sqrt(sum((len(numbers) - 1) * statistics.variance(numbers) for numbers in known) / freedom)
+
+
+def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float:
+    """Loop seconds at which a run's curve first has the goal's PSNR, SSIM and LPIPS at once; infinity if it never has.
+
+    Raises ValueError if the run was not measured on its way.
+    """
+    if not run.get("curve"):
+        raise ValueError(f"{run['key']} has no curve; give its protocol curve_every.")
+    for point in run["curve"]:
+        measured = [(point[name], goal[name], name) for name in DIGITS if goal[name] is not None]
+        if all(here is not None and (here <= end if name == "lpips" else here >= end) for here, end, name in measured):
+            return point["seconds"]
+    return math.inf
 
 
 @dataclass(frozen=True)
@@ -80,24 +107,25 @@ class Run:
 
     scene: str
     name: str
-    group: Sequence[Result]
-    """A result for each seed."""
-    base: Sequence[Result] = ()
-    """The same of the row whose loop is the measure; none if there is none."""
+    cell: Cell
+    base: Cell = ()
+    """The same scenes of the row that the others are compared with; none if there is none."""
     megapixels: float | None = None
     """Of an image."""
 
     def mean(self, field: str) -> float:
-        """Mean over the seeds; raises ValueError if no result has that number."""
-        if (value := mean(self.group, field)) is None:
-            raise ValueError(f"{self.group[0]['key']} has no {field}; leave that column out.")
+        """Mean over scenes and seeds; raises ValueError if no result has that number."""
+        if (value := mean_over_scenes(self.cell, field)) is None:
+            raise ValueError(f"{self.cell[0][0]['key']} has no {field}; leave that column out.")
         return value
 
     def spread(self, field: str, digits: int) -> str:
-        """The mean ± half the range of the seeds."""
-        several = len(values(self.group, field)) > 1
-        spread = f" ± {number(half_range(self.group, field), digits)}" if several else ""
-        return number(self.mean(field), digits) + spread
+        """The mean ± the pooled standard deviation; both numbers of two runs."""
+        known = [value for group in self.cell for value in values(group, field)]
+        if len(known) == 2 and len(self.cell) == 1:
+            return ", ".join(number(value, digits) for value in known)
+        spread = deviation(self.cell, field)
+        return number(self.mean(field), digits) + ("" if spread is None else f" ± {number(spread, digits)}")
 
     def seconds(self) -> str:
         """Loop seconds of which three digits count."""
@@ -105,8 +133,37 @@ class Run:
 
     def ratio(self, form: Callable[[float], str]) -> str:
         """Loop seconds, relative to those of `base`."""
-        seconds = mean(self.base, "loop_seconds")
+        seconds = mean_over_scenes(self.base, "loop_seconds")
         return NOTHING if seconds is None else form(self.mean("loop_seconds") / seconds)
+
+    def matched(self) -> str:
+        """Median of the loop seconds at which runs first match the last quality of `base`; a run of `base` its own."""
+        found = []
+        for group, base in zip(self.cell, self.base, strict=False):
+            goal = {name: mean(base, name) for name in DIGITS}
+            found += [seconds_to_match(run, run if any(run is other for other in base) else goal) for run in group]
+        seconds = statistics.median(found) if found else math.inf
+        return NOTHING if math.isinf(seconds) else number(seconds, 0 if seconds >= 100 else 1)
+
+    def views(self) -> list[list[float]]:
+        """PSNR of each held-out view of all scenes, over the seeds; raises ValueError if a run does not tell it."""
+        runs = [run for group in self.cell for run in group]
+        if without := [run["key"] for run in runs if not run.get("view_psnr")]:
+            raise ValueError(f"{without[0]} has no view_psnr; leave that column out.")
+        return [list(view) for group in self.cell for view in zip(*(run["view_psnr"] for run in group), strict=True)]
+
+    def median_view(self) -> str:
+        """Median over views of the means over seeds."""
+        return number(statistics.median(map(statistics.fmean, self.views())), 2)
+
+    def worst_view(self) -> str:
+        """The lowest PSNR of any view in any run."""
+        return number(min(map(min, self.views())), 2)
+
+    def seeds(self) -> str:
+        """The least number of runs of a scene, and how many scenes there are if several."""
+        seeds = str(min(map(len, self.cell)))
+        return seeds if len(self.cell) == 1 else f"{len(self.cell)} × {seeds}"
 
     def photos(self) -> str:
         """The scene, and how many training views of what size it has."""
@@ -126,32 +183,35 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "scene": ("Scene", lambda run: run.scene),
     "photos": ("Scene: training views", Run.photos),
     "method": ("Method", lambda run: run.name),
-    "date": ("Date", lambda run: run.group[0]["date"].split("T")[0]),
+    "date": ("Date", lambda run: run.cell[0][0]["date"].split("T")[0]),
     "iterations": ("Iterations", lambda run: f"{run.mean('iterations'):,.0f}"),
     "loop": ("Loop s", _spread("loop_seconds", 1)),
     "seconds": ("Loop s", Run.seconds),
     "ratio": ("Ratio", lambda run: run.ratio(_fraction)),
     "relative": ("Ratio", lambda run: run.ratio("{:.3f}".format)),
+    "matched": ("Matched s", Run.matched),
     "psnr": ("PSNR", _spread("psnr", 2)),
+    "median": ("Median view", Run.median_view),
+    "worst": ("Worst view", Run.worst_view),
     "ssim": ("SSIM", _spread("ssim", 4)),
     "lpips": ("LPIPS", _spread("lpips", 4)),
     "cc_psnr": ("PSNR, colours fitted", _spread("cc_psnr", 2)),
     "cc_ssim": ("SSIM, fitted", _spread("cc_ssim", 4)),
     "cc_lpips": ("LPIPS, fitted", _spread("cc_lpips", 4)),
     "gaussians": ("Gaussians", lambda run: count(run.mean("gaussians"))),
-    "peak": ("Peak GB", _spread("peak_gb", 1)),
-    "seeds": ("Seeds", lambda run: str(len(run.group))),
+    "peak": ("Peak GB", lambda run: number(run.mean("peak_gb"), 1)),
+    "seeds": ("Seeds", Run.seeds),
 }
 """Header and cell of each column of a table of runs."""
 WORDS = ("scene", "photos", "method", "date")
-_PRINTED = ("scene", "method", "loop", "relative", "psnr", "ssim", "lpips", "gaussians", "peak", "seeds")
+_PRINTED = ("scene", "method", "loop", "relative", "matched", "psnr", "median", "worst", "ssim", "lpips", "gaussians")
+_PRINTED += ("peak", "seeds")
 
 
-def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict: bool = True) -> str:
-    """Runs as a Markdown table, a line each.
+def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) -> str:
+    """Runs as a Markdown table, a line each, with some of COLUMNS.
 
-    The columns are names of COLUMNS, or a header and a field of seconds or milliseconds each. Raises ValueError if
-    there is no such column or, with `strict`, a number is missing.
+    Raises ValueError if there is no such column or, with `strict`, a number is missing.
     """
 
     def cell(column: Callable[[Run], str], run: Run) -> str:
@@ -162,9 +222,9 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict:
                 raise
             return NOTHING
 
-    if unknown := {name for name in columns if isinstance(name, str)} - COLUMNS.keys():
+    if unknown := {*columns} - COLUMNS.keys():
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
-    known = [COLUMNS[name] if isinstance(name, str) else (name[0], _spread(name[1], 1)) for name in columns]
+    known = [COLUMNS[name] for name in columns]
     lines = ([cell(column, run) for _, column in known] for run in runs)
     return grid([header for header, _ in known], lines, sum(name in WORDS for name in columns))
 
@@ -172,14 +232,22 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str | Sequence[str]], strict:
 def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
     """Results as a Markdown table, and under it what is wrong with it: failed runs, shared GPUs, several commits.
 
-    A line is the mean over seeds ± half their range of one scene and label; of several results with one seed the last
-    counts. The label `reference` has the loop seconds that are 1 in the column Ratio.
+    A line is of one scene and label; of several results with one seed the last counts. The label `reference` has the
+    loop seconds that are 1 in the column Ratio, and the quality that others match. The sentences also say how much the
+    seeds of a label differ over all scenes.
     """
     last = latest(rows)
     grouped = groups(last)
     bases = {scene: grouped.get((scene, reference or ""), []) for scene, _ in grouped}
-    runs = [Run(scene, label, group, bases[scene]) for (scene, label), group in grouped.items()]
-    sentences = [f"{r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in last if r.get("error")]
+    runs = [Run(scene, label, [group], [bases[scene]]) for (scene, label), group in grouped.items()]
+    sentences = []
+    for label in dict.fromkeys(label for _, label in grouped):
+        cell = [group for (_, other), group in grouped.items() if other == label]
+        if (told := _deviations(cell)) != NOTHING and len(cell) > 1:
+            sentences.append(
+                f"{label}: pooled standard deviation {told} of PSNR, SSIM and LPIPS over {len(cell)} scenes."
+            )
+    sentences += [f"{r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in last if r.get("error")]
     if any(row.get("jobs_per_gpu", 1) > 1 for row in last):
         sentences.append("Some runs shared a GPU: their times are not comparable.")
     ours = [row for row in last if str(row.get("method")).startswith("sadgs") and not row.get("error")]
@@ -196,21 +264,50 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
 def of_sweep(found: Groups, labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
     """A setting a line and scenes as columns: PSNR / SSIM / LPIPS / Gaussians, as differences from the first setting.
 
-    The second line is half the range of the first one's runs, and ¹ marks differences from or to a single run. `labels`
-    are the names of the rows' labels, and `scenes` the scenes whose mean a column is.
+    The second line is the pooled standard deviation of all settings' runs; ¹ and ² mark differences with so few seeds
+    on one side. `labels` are the names of the rows' labels, and `scenes` the scenes whose mean a column is.
     """
     for label in labels:
         if label not in {other for _, other in found}:
             raise ValueError(f"the rows have no row {label!r}.")
     (first, name), *others = labels.items()
-    bases = [[group_of(found, scene, first) for scene in column] for column in scenes.values()]
-    lines = [[name, *map(_absolute, bases)]]
-    if any(len(group) > 1 for base in bases for group in base):
-        lines.append(["half the range of its runs", *map(_spreads, bases)])
+    cells = {other: [[found.get((s, other), []) for s in column] for column in scenes.values()] for other in labels}
+    for scene in (scene for column in scenes.values() for scene in column):
+        group_of(found, scene, first)
+    spreads = [_deviations([group for other in labels for group in cells[other][i]]) for i in range(len(scenes))]
+    lines = [[name, *map(_absolute, cells[first])], ["standard deviation", *spreads]]
     for label, name in others:
-        settings = [[found.get((scene, label), []) for scene in column] for column in scenes.values()]
-        lines.append([name, *(_difference(*pair) for pair in zip(settings, bases, strict=True))])
+        pairs = zip(cells[label], cells[first], strict=True)
+        lines.append([name, *(_difference(*pair) + _few(*pair) if all(pair[0]) else NOTHING for pair in pairs)])
     return grid(["Setting", *scenes], lines)
+
+
+@dataclass(frozen=True)
+class Change:
+    """A line of a table of changes: what a change from one label to another does to some scenes, with a text."""
+
+    texts: Sequence[str]
+    """Of the columns before the numbers."""
+    old: Sequence[Cell]
+    """Of each scene, or of each capture that has folds."""
+    new: Sequence[Cell]
+    remark: str
+
+    def cells(self) -> list[str]:
+        """The texts, the least and the most of the differences, the seeds' spread, scenes × seeds, and the remark."""
+        if not self.old:
+            return [*self.texts, "not measured", NOTHING, NOTHING, self.remark]
+        parts = [_difference(*pair).split(" / ") for pair in zip(self.new, self.old, strict=True)]
+        ranges = [_range(column) for column in zip(*parts, strict=True)]
+        groups = [group for cell in (*self.old, *self.new) for group in cell]
+        count = f"{len(self.old)} × {min(map(len, groups))}"
+        return [*self.texts, " / ".join(ranges), _deviations(groups), count, self.remark]
+
+
+def of_changes(changes: Iterable[Change], header: Sequence[str], remark: str) -> str:
+    """Changes as a Markdown table, a line each, from the least to the most that a scene changes by."""
+    numbers = ["PSNR / SSIM / LPIPS / Gaussians", "Standard deviation", "Scenes × seeds"]
+    return grid([*header, *numbers, remark], [change.cells() for change in changes], len(header) + 4)
 
 
 def group_of(found: Groups, scene: str, label: str) -> Sequence[Result]:
@@ -220,44 +317,35 @@ def group_of(found: Groups, scene: str, label: str) -> Sequence[Result]:
     return found[scene, label]
 
 
-def _means(cell: Sequence[Sequence[Result]], field: str) -> float | None:
-    """Mean over scenes of the means over seeds."""
-    known = [value for group in cell if (value := mean(group, field)) is not None]
-    return sum(known) / len(known) if len(known) == len(cell) else None
+def _absolute(cell: Cell) -> str:
+    numbers = [number(mean_over_scenes(cell, field), digits) for field, digits in DIGITS.items()]
+    return " / ".join([*numbers, count(mean_over_scenes(cell, "gaussians") or 0)])
 
 
-def _absolute(cell: Sequence[Sequence[Result]]) -> str:
-    numbers = [number(_means(cell, field), digits) for field, digits in DIGITS.items()]
-    return " / ".join([*numbers, count(_means(cell, "gaussians") or 0)])
+def _deviations(cell: Cell) -> str:
+    """Those of PSNR, SSIM and LPIPS."""
+    spreads = [number(deviation(cell, field), digits) for field, digits in DIGITS.items()]
+    return NOTHING if spreads[0] == NOTHING else " / ".join(spreads)
 
 
-def _spreads(cell: Sequence[Sequence[Result]]) -> str:
-    if any(len(group) < 2 for group in cell):
-        return NOTHING
-    spreads = {field: sum(half_range(group, field) for group in cell) / len(cell) for field in DIGITS}
-    return " / ".join(number(spreads[field], digits) for field, digits in DIGITS.items())
-
-
-def _difference(cell: Sequence[Sequence[Result]], base: Sequence[Sequence[Result]]) -> str:
-    if not all(cell):
-        return NOTHING
+def _difference(cell: Cell, base: Cell) -> str:
     parts = []
     for field, digits in DIGITS.items():
-        new, old = _means(cell, field), _means(base, field)
+        new, old = mean_over_scenes(cell, field), mean_over_scenes(base, field)
         parts.append(NOTHING if new is None or old is None else number(new - old, digits, signed=True))
-    ratio = (_means(cell, "gaussians") or 0) / (_means(base, "gaussians") or 1)
-    single = any(len(group) < 2 for group in (*cell, *base))
-    return " / ".join([*parts, f"×{ratio:.2f}"]) + (" ¹" if single else "")
+    ratio = (mean_over_scenes(cell, "gaussians") or 0) / (mean_over_scenes(base, "gaussians") or 1)
+    return " / ".join([*parts, f"×{ratio:.2f}"])
 
 
-def of_growth(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Milliseconds of steps of some numbers of Gaussians, in images of some sizes."""
-    lines = (
-        (f"{row['gaussians']:,.0f}", f"{row['megapixels']:g}", number(row["ours_ms"], 2), number(row["gsplat_ms"], 2),
-         f"{row['gsplat_ms'] / row['ours_ms']:.1f}")
-        for row in rows
-    )  # fmt: skip
-    return grid(["Gaussians", "Megapixels", "Ours, ms", "gsplat and torch, ms", "Ratio"], lines, names=0)
+def _few(cell: Cell, base: Cell) -> str:
+    """A mark on a difference of fewer than three seeds."""
+    return {1: " ¹", 2: " ²"}.get(min(map(len, (*cell, *base))), "")
+
+
+def _range(differences: Sequence[str]) -> str:
+    """The least and the most of differences that are written like those of `_difference`."""
+    ordered = sorted(differences, key=lambda text: float(text.replace("−", "-").lstrip("×")))
+    return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1].lstrip('×')}"
 
 
 def _short(value: float) -> str:
@@ -287,14 +375,14 @@ def of_approximations(rows: Sequence[Mapping[str, Any]]) -> str:
 
 @dataclass
 class Command:
-    """Print the table of a results file, and plot quality against time and the number of Gaussians."""
+    """Print the table of a results file, and plot quality against time."""
 
     results: Positional[Path]
     """JSON-lines file that python -m benchmarks wrote"""
     reference: str | None = None
-    """label of the row whose loop seconds are 1 in the column Ratio"""
+    """label of the row that the columns Ratio and Matched compare with"""
     plots: Path | None = None
-    """folder that takes quality-time.png and quality-count.png"""
+    """folder that takes quality-time.png"""
 
     def __call__(self) -> int:
         rows = results.read(self.results)
@@ -309,6 +397,5 @@ class Command:
             from benchmarks import plots
 
             self.plots.mkdir(parents=True, exist_ok=True)
-            for name, cost in (("quality-time", "loop_seconds"), ("quality-count", "gaussians")):
-                plots.save(plots.quality(grouped.items(), cost), self.plots / f"{name}.png")
+            plots.save(plots.quality(grouped.items()), self.plots / "quality-time.png")
         return 0

@@ -82,7 +82,7 @@ def test_runs_are_a_line_each(tmp_path: Path):
 | Scene: training views | Method | Loop s | Ratio | PSNR | Gaussians |
 | --- | --- | ---: | ---: | ---: | ---: |
 | fox: 43 of 0.68 MP | slow | 250.0 | 1 | 29.00 | 9,999 |
-| fox: 43 of 0.68 MP | ours | 10.5 ± 0.5 | 1/24 | 30.50 ± 0.50 | 200k |
+| fox: 43 of 0.68 MP | ours | 10.0, 11.0 | 1/24 | 30.00, 31.00 | 200k |
 | tree: 43 | ours, elsewhere | 10.0 | – | 30.00 | 200k |
 
 <!-- end -->
@@ -98,18 +98,18 @@ def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
     # Castle is the mean of its two scenes; its second setting lacks one of them.
     assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
-    assert lines[1] == "| half the range of its runs | 0.25 / .0000 / .0000 | – |"
-    assert lines[2] == "| × 2 | −0.25 / +.0100 / −.0100 / ×1.50 | – |"
+    assert lines[1] == "| standard deviation | 0.25 / .0000 / .0000 | – |"
+    assert lines[2] == "| × 2 | −0.25 / +.0100 / −.0100 / ×1.50 ² | – |"
 
 
-def test_a_difference_that_rests_on_a_single_run_is_marked(tmp_path: Path):
+def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     rows = [row("fox", "T1", 0), row("fox", "T1", 1), row("fox", "T2", lpips=0.1 - 1e-9)]
     folder = checkout(tmp_path, {"sweep": {**SWEEP, "scenes": {"fox": ["fox"]}}}, {"sweep.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
     assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
-def test_approximations_are_printed_as_their_command_does_and_growth_with_its_ratio(tmp_path: Path):
+def test_approximations_are_printed_as_their_command_does(tmp_path: Path):
     common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
     rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
     tables = {
@@ -117,23 +117,36 @@ def test_approximations_are_printed_as_their_command_does_and_growth_with_its_ra
         "one": {
             "kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo", "variants": ["1 sample"]
         },
-        "growth": {"kind": "growth", "rows": "growth.jsonl"},
     }  # fmt: skip
-    names = ("gaussians", "megapixels", "ours_ms", "gsplat_ms")
-    growth: list[Any] = [
-        dict(zip(names, row, strict=True)) for row in ((100_000, 2.0, 2.0, 5.0), (1_000_000, 0.3, 2.5, 7.5))
-    ]
-    folder = checkout(tmp_path, tables, {"a.jsonl": rows, "growth.jsonl": growth})
+    folder = checkout(tmp_path, tables, {"a.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
     text = (folder / "README.md").read_text("utf8")
     assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
     assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
-    assert "| 100,000 | 2 | 2.00 | 5.00 | 2.5 |\n| 1,000,000 | 0.3 | 2.50 | 7.50 | 3.0 |" in text
+
+
+def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tmp_path: Path):
+    change = {"rows": ["sweep.jsonl"], "change": ["T1", "T2"], "remark": "why"}
+    lines = [
+        {**change, "texts": ["× 2", "theirs"], "scenes": {"fox": ["fox"], "castle": ["castle"]}},
+        {**change, "texts": ["× 2, fox", ""], "scenes": ["fox"]},
+        {"texts": ["nothing", "theirs"], "remark": "no run"},
+    ]
+    tables = {"claims": {"kind": "changes", "header": ["Claim", "Paper"], "remark": "Explanation", "lines": lines}}
+    folder = checkout(tmp_path, tables, {"sweep.jsonl": ROWS["sweep.jsonl"]})
+    assert bench.main(["documents", str(folder)]) == 0
+    assert (folder / "README.md").read_text("utf8").splitlines()[4:9] == [
+        "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Standard deviation | Scenes × seeds | Explanation |",
+        "| --- | --- | --- | --- | --- | --- |",
+        "| × 2 | theirs | −1.00 to −0.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | 0.25 / .0000 / .0000 "
+        "| 2 × 1 | why |",
+        "| × 2, fox |  | −0.25 / +.0100 / −.0100 / ×1.50 | 0.25 / .0000 / .0000 | 1 × 2 | why |",
+        "| nothing | theirs | not measured | – | – | no run |",
+    ]
 
 
 FIGURE = {
     "kind": "peers",
-    "cost": "loop_seconds",
     "lines": [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"slow": "theirs 30k", "ours": "ours"}}],
     "elsewhere": [{"rows": "runs.jsonl", "scenes": ["tree"], "labels": {"ours": "ours"}}],
 }
@@ -163,12 +176,12 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
 
 
 WRONG_FIGURES: dict[str, tuple[Any, str]] = {
-    "an unknown cost": ({**FIGURE, "cost": "price"}, "fox/slow/0 has no price"),
+    "an unknown key": ({**FIGURE, "cost": "price"}, "unexpected keyword argument 'cost'"),
     "an unknown label": (
         {**FIGURE, "elsewhere": [{**FIGURE["lines"][0], "labels": {"none": "none"}}]},
         "no row 'none'",
     ),
-    "a missing key": ({"kind": "peers", "cost": "price"}, "missing 1 required positional argument: 'lines'"),
+    "a missing key": ({"kind": "peers"}, "missing 1 required positional argument: 'lines'"),
     "a list": ([FIGURE], "figure peers: "),
     "a kind of table": ({**FIGURE, "kind": "sweep"}, "no attribute 'sweep_drawn'"),
 }

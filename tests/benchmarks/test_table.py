@@ -33,7 +33,7 @@ def write_lines(path: Path, rows: list[dict[str, Any]]) -> str:
     return str(path)
 
 
-def test_the_command_prints_the_table_and_draws_two_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_the_table_and_draws_a_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     curve = [{"step": s, "seconds": s / 150, "psnr": 20 + s / 300, "ssim": 0.8, "lpips": None} for s in (0, 1500, 3000)]
     rows = [
         result(label="a", curve=curve), result(label="a", seed=1, curve=curve), result(label="b", loop_seconds=200.0),
@@ -43,11 +43,68 @@ def test_the_command_prints_the_table_and_draws_two_plots(tmp_path: Path, capsys
     lines = write_lines(tmp_path / "r.jsonl", rows)
     assert bench.main(["table", lines, "--reference", "b", "--plots", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "| fox | a | 20.5 ± 0.5 | 0.102 | 30.50 ± 0.50 |" in printed and "| _hidden |" in printed
+    assert "| fox | a | 20.0, 21.0 | 0.102 | – | 30.00, 31.00 | – | – |" in printed and "| _hidden |" in printed
     assert "- south & west, broken, seed 0 failed: RuntimeError: out of <memory>.\n" in printed
-    for name in ("quality-time", "quality-count"):
-        with Image.open(tmp_path / "out" / f"{name}.png") as image:
-            assert image.format == "PNG" and image.width == round(7.2 * 200)
+    with Image.open(tmp_path / "out" / "quality-time.png") as image:
+        assert image.format == "PNG" and image.width == round(7.2 * 200)
+
+
+def measured(seed: int, *points: tuple[float, float, float], label: str = "ours", scene: str = "fox") -> dict[str, Any]:
+    """A run with a curve of seconds, PSNR and LPIPS, of which the last are the run's."""
+    curve = [{"step": 500 * i, "seconds": s, "psnr": p, "ssim": 0.9, "lpips": q} for i, (s, p, q) in enumerate(points)]
+    seconds, psnr, lpips = points[-1]
+    return result(scene, label, seed, curve=curve, loop_seconds=seconds, psnr=psnr, lpips=lpips)
+
+
+THEIRS = [
+    measured(0, (10.0, 29.0, 0.3), (20.0, 31.0, 0.2), (30.0, 30.0, 0.2), label="theirs"),
+    measured(1, (10.0, 29.0, 0.3), (20.0, 30.0, 0.2), (30.0, 30.4, 0.1), label="theirs"),
+    measured(2, (10.0, 29.0, 0.3), (22.0, 31.0, 0.1), (30.0, 30.2, 0.15), label="theirs"),
+]
+
+
+def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_reference_its_own():
+    """The reference ends with means of 30.2 dB and .15; its second run is at its best at the end alone."""
+    ours = [
+        measured(0, (1.0, 30.1, 0.1), (2.0, 30.3, 0.16), (3.0, 30.3, 0.15), (4.0, 30.0, 0.2)),
+        measured(1, (1.5, 30.2, 0.14)),
+        measured(2, (1.0, 33.0, 0.2)),
+    ]
+    never = [measured(0, (1.0, 33.0, 0.2))]
+    assert table.Run("fox", "ours", [ours], [THEIRS]).matched() == "3.0"
+    assert table.Run("fox", "theirs", [THEIRS], [THEIRS]).matched() == "22.0"
+    assert table.Run("fox", "never", [never], [THEIRS]).matched() == "–"
+    assert table.Run("fox", "alone", [ours]).matched() == "–"
+    with pytest.raises(ValueError, match="fox/ours/0 has no curve; give its protocol curve_every"):
+        table.Run("fox", "ours", [[result()]], [THEIRS]).matched()
+
+
+def test_the_spread_is_the_standard_deviation_pooled_over_folds_and_needs_three_seeds():
+    folds = [[result(psnr=p) for p in (30.0, 31.0)], [result(psnr=p) for p in (20.0, 23.0)]]
+    assert table.deviation(folds, "psnr") == pytest.approx(((0.5 + 4.5) / 2) ** 0.5)
+    assert table.deviation([[result(psnr=p) for p in (1.0, 2.0, 3.0)]], "psnr") == pytest.approx(1.0)
+    assert table.deviation(folds[:1], "psnr") is None and table.deviation([[result()], [result()]], "psnr") is None
+    assert table.Run("castle", "ours", folds).spread("psnr", 2) == "26.00 ± 1.58"
+    assert table.Run("castle", "ours", folds[:1]).spread("psnr", 2) == "30.00, 31.00"
+    assert table.Run("castle", "ours", folds).seeds() == "2 × 2"
+
+
+def test_single_views_of_all_folds_are_in_the_median_and_in_the_worst():
+    folds = [
+        [result(view_psnr=[30.0, 10.0]), result(view_psnr=[32.0, 20.0])],
+        [result(view_psnr=[25.0]), result(view_psnr=[26.0])],
+    ]
+    run = table.Run("castle", "ours", folds)
+    assert (run.median_view(), run.worst_view()) == ("25.50", "10.00")
+    with pytest.raises(ValueError, match="has no view_psnr"):
+        table.Run("castle", "ours", [[result()]]).worst_view()
+
+
+def test_the_printed_table_pools_the_seeds_of_all_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    rows = [result(scene, seed=seed) for scene in ("fox", "south") for seed in (0, 1)]
+    assert bench.main(["table", write_lines(tmp_path / "r.jsonl", rows)]) == 0
+    told = "- ours: pooled standard deviation 0.71 / .0000 / .0000 of PSNR, SSIM and LPIPS over 2 scenes.\n"
+    assert told in capsys.readouterr().out
 
 
 def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -84,26 +141,6 @@ def test_wrong_input_is_one_sentence_and_writes_nothing(
     assert not (tmp_path / "out").exists()
 
 
-def test_pareto_front_of_a_hand_made_case():
-    points = [(3.0, 30.0), (1.0, 20.0), (2.0, 30.0), (2.0, 25.0), (4.0, 29.0), (5.0, 31.0), (1.0, 20.0)]
-    assert plots.pareto_front(points, higher_is_better=True) == [(1.0, 20.0), (2.0, 30.0), (5.0, 31.0)]
-    assert plots.pareto_front([(1, 0.3), (2, 0.2), (3, 0.25)], higher_is_better=False) == [(1, 0.3), (2, 0.2)]
-    assert plots.pareto_front([], higher_is_better=True) == []
-
-
-def test_pareto_front_is_drawn_as_steps_through_the_means():
-    groups = table.groups([
-        result(label="small", gaussians=100, psnr=20.0),
-        result(label="large", gaussians=300, psnr=29.0), result(label="large", seed=1, gaussians=500, psnr=31.0),
-        result(label="worse", gaussians=900, psnr=25.0),
-    ])  # fmt: skip
-    axes = plots.quality(groups.items(), "gaussians").axes[0]
-    front = next(line for line in axes.lines if line.get_drawstyle() == "steps-post")
-    xs, ys = (np.asarray(front.get_data()[i]).tolist() for i in (0, 1))
-    assert list(zip(xs, ys, strict=True))[1:3] == [(100, 20.0), (400, 30.0)]
-    assert ys[-1] == 30.0 and xs[-1] == axes.get_xlim()[1]
-
-
 def test_labels_are_told_apart_without_colour():
     looks = list(plots.styles(f"label {i}" for i in range(12)).values())
     assert len({look["marker"] for look in looks}) == 12
@@ -113,7 +150,7 @@ def test_labels_are_told_apart_without_colour():
 def test_a_label_looks_the_same_in_all_panels_and_in_the_legend():
     groups = table.groups([result(label="a"), result(label="b"), result(scene="south", label="b")])
     looks = plots.styles(label for _, label in groups)
-    figure = plots.quality(groups.items(), "loop_seconds")
+    figure = plots.quality(groups.items())
     markers = [{str(line.get_marker()) for line in axes.lines} for axes in figure.axes]
     assert (
         markers[:3] == [{looks["a"]["marker"], looks["b"]["marker"]}] * 3
@@ -132,7 +169,7 @@ def test_curves_are_means_over_seeds_that_end_with_the_run():
         return [{"step": s, "seconds": pace * s, "psnr": offset + psnr[s], "ssim": 0.8, "lpips": None} for s in psnr]
 
     groups = table.groups([result(curve=curve(0, 3.0)), result(seed=1, curve=curve(2, 5.0))])
-    lines = plots.quality(groups.items(), "loop_seconds").axes[0].lines
+    lines = plots.quality(groups.items()).axes[0].lines
     mean = max(lines, key=lambda line: line.get_linewidth() if line.get_linestyle() != "None" else 0)
     points = np.asarray(mean.get_xydata()).tolist()
     assert points == [[8.0, 28.0], [12.0, 30.5]], "21 dB is far worse than the end and left out"
@@ -141,13 +178,13 @@ def test_curves_are_means_over_seeds_that_end_with_the_run():
 @pytest.mark.parametrize("shared", [1, 4])
 def test_times_of_runs_that_shared_a_gpu_are_marked(shared: int):
     groups = table.groups([result(jobs_per_gpu=shared)])
-    title = plots.quality(groups.items(), "loop_seconds").get_supxlabel()
+    title = plots.quality(groups.items()).get_supxlabel()
     assert ("not comparable" in title) == (shared > 1)
 
 
 def test_text_is_readable_and_legends_do_not_reach_beyond_the_figure():
     groups = table.groups([result(label=f"method number {i} with a long name") for i in range(20)])
-    figure = plots.quality(groups.items(), "loop_seconds")
+    figure = plots.quality(groups.items())
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
     panel = figure.axes[0].get_window_extent()
@@ -164,7 +201,7 @@ def test_names_of_points_stand_inside_beside_their_points_and_apart():
         ("ours", False, 11, 31.9, 0.185),
         ("ours, earlier", True, 30, 31.9, 0.19),
     ]
-    figure = plots.peers(points, "loop_seconds")
+    figure = plots.peers(points)
     assert [axes.get_ylabel()[:4] for axes in figure.axes] == ["PSNR", "LPIP"]
     for axes in figure.axes:
         texts = [text for text in axes.texts if isinstance(text, Annotation)]
