@@ -1,10 +1,7 @@
 """`sadgs PHOTOS_OR_VIDEO`: one command from photos or a video to a splat that opens in a browser.
 
 Its folder holds the cameras in `scene`, the run in `training`, all output in `log`, the splats, and the state of the
-work in `settings.json`.
-
-The cameras of added photos join those of the scene, which stay as they are, and another run is trained in the same
-frame, with the same views held out. The earlier run is removed when the new splats are written.
+work in `settings.json`. Added photos join the scene, and another run takes the place of the earlier one.
 """
 
 from __future__ import annotations
@@ -52,10 +49,6 @@ _LOCK_SECONDS = 10.0  # Time in which the last stage of a killed run may save
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
 """Stage and part of the time that begin with a stage, if others than itself."""
 _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
-_ON_CPU = (
-    "torch finds no GPU on this machine, so training runs on the CPU, which is for small scenes: a GPU with CUDA is "
-    "about a hundred times as fast."
-)
 
 
 @dataclass
@@ -298,8 +291,8 @@ class PhotosToSplat:
             nonlocal total, count
             if event == "training begins":
                 total = f"{fields['iterations']:,}"
-                if fields["on_cpu"]:
-                    line.print(_ON_CPU)
+            elif event == "on the CPU":
+                line.print(fields["told"])
             elif event == "iteration":
                 # Meanwhile it imports what export needs.
                 self._exporter = self._exporter or self.worker("export", _EXPORT)

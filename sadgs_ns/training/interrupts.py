@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import signal
 import stat
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
 
-_HANG_UP_SECONDS = 2.0  # Longest time from a write that fails because the terminal is gone until its signal comes
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a run to stop. The last one is that of a terminal that is gone, as when ssh is cut off."""
 
@@ -59,14 +56,6 @@ class Interrupts:
         """Raise Interrupted if a signal has come."""
         if self.received is not None:
             raise Interrupted(self.received)
-
-    def cause_of(self, error: OSError) -> Interrupted | None:
-        """Return the hang-up that made a write fail, if it did; the signal may come after the terminal is gone."""
-        if error.errno == errno.EIO and signal.SIGHUP in self._previous:
-            end = time.monotonic() + _HANG_UP_SECONDS
-            while self.received is None and time.monotonic() < end:
-                time.sleep(0.01)
-        return Interrupted(self.received) if self.received == signal.SIGHUP else None
 
     def _handle(self, number: int, frame: object) -> None:
         if self.received is not None:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sadgs_ns.events import report
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.memory_plan import fit_to_memory, training_size
@@ -47,7 +48,6 @@ def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
 
 
 def _pixels(cameras: Cameras) -> float:
-    """Return the mean number of pixels of a view."""
     return float((cameras.height * cameras.width).double().mean())
 
 
@@ -128,7 +128,9 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
             "time."
         )
     if pipeline.device.type == "cpu":
-        warn(cpu_notice(torch.get_num_threads()))
+        told = cpu_notice(torch.get_num_threads())
+        warn(told)
+        report("on the CPU", told=told)
 
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 
 from sadgs_ns.training import compile_ahead
 
-compile_ahead.begin()  # It goes on while the rest is imported.
+if {"-h", "--help"}.isdisjoint(sys.argv):
+    compile_ahead.begin()  # It goes on while the rest is imported.
 
 import numpy as np
 import torch

@@ -90,7 +90,7 @@ class SadgsTrainer(Trainer):
             plan = self.pipeline.model.plan
             if processes.is_rank_zero():
                 plan.write(self.base_dir)
-            events.report("training begins", iterations=plan.iterations, on_cpu=self.device == "cpu")
+            events.report("training begins", iterations=plan.iterations)
             last = [TrainingCallbackLocation.AFTER_TRAIN]
             self.callbacks.append(TrainingCallback(last, lambda step: self._print_next_commands()))
             with processes.local_rank_zero_first(self.world, self.local_rank):
@@ -211,11 +211,6 @@ class SadgsTrainer(Trainer):
                 self._stop_if_diverged()
             except Interrupted as interrupted:
                 self._stop(interrupted, total)
-            except OSError as error:
-                interruption = self._interrupts.cause_of(error)
-                if interruption is None or self._stepping:
-                    raise
-                self._stop(interruption, total)
 
     @property
     def _resume(self) -> str:

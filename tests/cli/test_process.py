@@ -39,13 +39,14 @@ from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 
 from sadgs_ns.cli.cameras import command as program
 from sadgs_ns.cli.cameras import features, reconstruct
-from sadgs_ns.cli.cameras.colmap import Colmap, start_colmap
+from sadgs_ns.cli.cameras.colmap import make_model, start_colmap
 from sadgs_ns.cli.cameras.command import Process, main, photos_added, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
 from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, pairs_to_match
 from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
+from sadgs_ns.cli.worker import Worker
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
@@ -510,7 +511,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
     made: dict[str, tuple[int, int]] = {}
     masks: dict[str, Any] = {}
 
-    def look(self: Colmap, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
+    def look(colmap: Worker, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
         assert groups == [["a.jpg", "b.jpg", "c.jpg", "d.jpg"]]
         for name in itertools.chain(*groups):
             with Image.open(photos / name) as image:
@@ -518,7 +519,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
         masks.update((path.name, Image.open(path).getextrema()) for path in (out / "work").glob("masks/*"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Colmap, "make_model", look)
+    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", look)
     assert main([str(source), str(out)]) == 130
     assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
@@ -695,7 +696,7 @@ def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     with pytest.raises(RunError, match=r"^COLMAP failed while it worked on features \(.+\); run the same com"):
         arguments = tmp_path, [["a.png"]], "exhaustive", 0, model, None, []
         with start_colmap() as colmap:
-            colmap.make_model(*arguments, folder=tmp_path, report=lambda stage, *others: steps.append(stage))
+            make_model(colmap, *arguments, folder=tmp_path, report=lambda stage, *others: steps.append(stage))
     assert steps == ["features"] and not list(tmp_path.iterdir())
 
 
@@ -720,12 +721,12 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Has COLMAP register so many of 12 photos at once, instead of running it."""
 
     def register(count: int) -> None:
-        def stand_in(self: Colmap, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
+        def stand_in(colmap: Worker, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
             return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
 
-        monkeypatch.setattr(Colmap, "make_model", stand_in)
+        monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", stand_in)
         monkeypatch.setattr(program, "_publish", lambda *others: None)
 
     return register
@@ -767,12 +768,12 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
 def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     command = [str(black(tmp_path / "photos", "a.png", "b.png", "c.png")), str(tmp_path / "out")]
 
-    def run_another(self: Colmap, *arguments: object, folder: Path, **others: object) -> None:
+    def run_another(colmap: Worker, *arguments: object, folder: Path, **others: object) -> None:
         (folder / "models").mkdir()
         assert main(command) == 2 and (folder / "models").is_dir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Colmap, "make_model", run_another)
+    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
@@ -1005,12 +1006,12 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The photos of every run, each of which is interrupted before it looks for features in them."""
     runs: list[list[str]] = []
 
-    def stop(self: Colmap, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
+    def stop(colmap: Worker, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
         assert all((photos / name).is_file() for name in itertools.chain(*groups))
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Colmap, "make_model", stop)
+    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", stop)
     return runs
 
 

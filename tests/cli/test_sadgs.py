@@ -122,7 +122,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     printed = capsys.readouterr()
     assert printed.err == "sadgs: stopped; run the same command again to resume.\n"
     assert lines_of(printed.out) == {"cameras": "10 of 10 photos registered", "training": "stopping"}
-    assert sadgs._ON_CPU in printed.out
+    assert "This run trains on the CPU, which is for small scenes" in printed.out
     (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")
     assert 10 <= int(checkpoint.stem[5:]) < 14
     assert main([*command, "--pipeline.effort", "2"]) == 2
@@ -374,7 +374,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             Path(command[2]).mkdir()
             (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
-        on_event("training begins", iterations=8, on_cpu=False)
+        on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
         (work._run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
         (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()

@@ -12,7 +12,6 @@ starts anew.
 from __future__ import annotations
 
 import dataclasses
-import errno
 import os
 import re
 import shlex
@@ -301,27 +300,6 @@ def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, m
     assert stopped.value.code == 128 + signal.SIGHUP
     assert checkpoints(trainer) == ["step-000000003.ckpt"]
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
-
-
-@pytest.mark.hard_case("a write to the terminal fails before SIGHUP comes", "the run still ends as hung up")
-@pytest.mark.usefixtures("hang_up_by_default")
-def test_a_write_that_fails_before_the_hang_up_comes_does_not_hide_it(
-    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
-):
-    trainer = set_up(config)
-    terminal = threading.Timer(0.3, send, [signal.SIGHUP])
-
-    def lost(step: int) -> None:
-        if step == 3:
-            terminal.start()
-            raise OSError(errno.EIO, "Input/output error")
-
-    update = trainer._update_viewer_state
-    monkeypatch.setattr(trainer, "_update_viewer_state", lambda step: (update(step), lost(step)))
-    with pytest.raises(SystemExit) as stopped:
-        trainer.train()
-    assert stopped.value.code == 128 + signal.SIGHUP
-    assert checkpoints(trainer) == ["step-000000003.ckpt"]
 
 
 def in_terminal_under_nohup(*arguments: Any) -> None:

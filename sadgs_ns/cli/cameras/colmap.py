@@ -13,7 +13,6 @@ import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,38 +27,32 @@ _LOG_PREFIX = re.compile(r"^([IWEF]\d{8} .*?\] |\s*what\(\):\s*)?(\[[\w.]+:\d+\]
 _ERROR_LINE = re.compile(r"^[EF]\d{8} |^\s*what\(\): |Error: ")
 
 
-@dataclass(frozen=True)
-class Colmap:
-    """The process of COLMAP."""
-
-    worker: Worker
-
-    def make_model(self, *arguments: Any, folder: Path, report: Report) -> Any:
-        """Call `reconstruct.make_model`, which writes to `folder`, as `Worker.run` does.
-
-        Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
-        """
-        begun = "its start"
-
-        def on_event(event: str, stage: str, done: int, total: int) -> None:
-            nonlocal begun
-            begun = stage
-            report(stage, done, total)
-
-        try:
-            return self.worker.run(*arguments, on_event=on_event)
-        except WorkerError as error:
-            raise _error_of(error, begun, folder) from None
-
-
 @contextlib.contextmanager
-def start_colmap() -> Iterator[Colmap]:
+def start_colmap() -> Iterator[Worker]:
     """Start the process of COLMAP, which imports what it needs, and kill it when the context is left."""
     with (
         tempfile.TemporaryDirectory() as folder,
         Worker("sadgs_ns.cli.cameras.colmap_process:make_model", Path(folder) / "colmap.txt") as worker,
     ):
-        yield Colmap(worker)
+        yield worker
+
+
+def make_model(colmap: Worker, *arguments: Any, folder: Path, report: Report) -> Any:
+    """Call `reconstruct.make_model`, which writes to `folder`, in the process of COLMAP, as `Worker.run` does.
+
+    Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
+    """
+    begun = "its start"
+
+    def on_event(event: str, stage: str, done: int, total: int) -> None:
+        nonlocal begun
+        begun = stage
+        report(stage, done, total)
+
+    try:
+        return colmap.run(*arguments, on_event=on_event)
+    except WorkerError as error:
+        raise _error_of(error, begun, folder) from None
 
 
 def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:

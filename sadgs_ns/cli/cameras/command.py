@@ -24,7 +24,7 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns import events
-from sadgs_ns.cli.cameras.colmap import Report, start_colmap
+from sadgs_ns.cli.cameras.colmap import Report, make_model, start_colmap
 from sadgs_ns.cli.cameras.folder import find_source, find_videos
 from sadgs_ns.cli.cameras.panoramas import VIEWS
 from sadgs_ns.cli.cameras.photos import (
@@ -207,7 +207,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
         photos = [photo for photo in photos if photo.camera]  # without the views
         groups = [[photo.name] for photo in photos] if options.camera_per_photo else photos_by_camera(photos)
         arguments = (folder, groups, matching, options.max_size, scene.model, scene.base, rigs)
-        summary = Summary(**colmap.make_model(*arguments, folder=work, report=report))
+        summary = Summary(**make_model(colmap, *arguments, folder=work, report=report))
         _publish(work / "undistorted", options.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
             shutil.rmtree(scene.model)

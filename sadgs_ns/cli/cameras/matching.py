@@ -36,7 +36,7 @@ def match_descriptors(one: Tensor, other: Tensor) -> Tensor:
     """
     if not len(one) or not len(other):
         return torch.zeros((0, 2), dtype=torch.int64, device=one.device)
-    return torch.stack(_mutual(one, other), dim=1)
+    return torch.stack(_mutual(one / 512, other / 512), dim=1)
 
 
 def similar_pairs(descriptors: Sequence[Tensor], neighbors: int) -> list[tuple[int, int]]:
@@ -61,6 +61,7 @@ def similar_pairs(descriptors: Sequence[Tensor], neighbors: int) -> list[tuple[i
 
 def _shared(descriptors: Tensor) -> Tensor:
     """Count the matches between any two photos; padding of zeros matches nothing. uint8 [N, M, 128] → int64 [N, N]"""
+    descriptors = descriptors / 512
     counts = torch.zeros((len(descriptors),) * 2, dtype=torch.int64, device=descriptors.device)
     for i in range(len(descriptors)):
         for start in range(i + 1, len(descriptors), _COMPARED_AT_ONCE):
@@ -71,8 +72,8 @@ def _shared(descriptors: Tensor) -> Tensor:
 
 
 def _mutual(one: Tensor, other: Tensor) -> tuple[Tensor, ...]:
-    """Return the indices of matches in both, after those in the batch. uint8 [..., N, 128], [..., M, 128]"""
-    cosines = (one / 512) @ (other / 512).mT  # The sums of products of bytes are exact. [..., N, M]
+    """Return the indices of matches in both, after those in the batch. [..., N, 128], [..., M, 128]"""
+    cosines = one @ other.mT  # The sums of products of bytes are exact. [..., N, M]
     nearest, back = _nearest(cosines), _nearest(cosines.mT)
     index = torch.arange(one.shape[-2], device=one.device)
     is_mutual = (nearest >= 0) & (back.gather(-1, nearest.clamp_min(0)) == index)

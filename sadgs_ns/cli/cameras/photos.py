@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import math
 import os
 import re
 import shutil
@@ -13,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
@@ -119,7 +117,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
         width, height = image.size
         size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
         lens = exif.get_ifd(ExifTags.IFD.Exif)
-        focals = [max((0.0, *_numbers(lens.get(tag)))) for tag in _FOCAL_LENGTHS]  # mm; 0 is unknown, too
+        focals = [str(lens.get(tag) or None) for tag in _FOCAL_LENGTHS]  # as text: 0/0 is not equal to itself
         camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
         has_alpha, is_read = image.has_transparency_data, image.format in COLMAP_FORMATS
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
@@ -128,15 +126,6 @@ def _read_photo(folder: Path, name: str) -> Photo:
         image.load()
         is_turned = orientation in NOT_UPRIGHT
         return Photo(name, size, camera, has_alpha, is_read, is_turned, is_panorama(image, size))
-
-
-def _numbers(value: Any) -> tuple[float, ...]:
-    """Return EXIF's number or numbers, or none if one of them is not finite, such as 0/0."""
-    try:
-        numbers = tuple(float(number) for number in (value if isinstance(value, tuple) else (value,)))
-    except (TypeError, ValueError, ZeroDivisionError):
-        return ()
-    return numbers if all(map(math.isfinite, numbers)) else ()
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:
