@@ -124,7 +124,6 @@ def export(options: Export) -> int:
 
 
 def _check(options: Export) -> None:
-    """Raise InputError if an option does not suit the format."""
     suffix, voxel_size = format_of(options.output), options.voxel_size
     if suffix == ".html" and options.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")

@@ -38,10 +38,6 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
     named = {name.lower(): name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
     channels = next((names for names in COLORS if named.keys() >= set(names)), None)
-    if channels is None and (packed := named.keys() & {"rgb", "rgba"}):  # PCL packs bytes into one number.
-        bits = np.ascontiguousarray(vertices[named[packed.pop()]])
-        bits = bits.astype(np.float32).view(np.uint32) if bits.dtype.kind == "f" else bits
-        return positions, np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
     if channels is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
     colors = np.stack([vertices[named[channel]] for channel in channels], axis=-1).astype(np.float64)

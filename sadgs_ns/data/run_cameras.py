@@ -19,12 +19,11 @@ from sadgs_ns.errors import InputError, reason
 
 @dataclass(frozen=True)
 class RunCameras:
-    """C pinhole cameras in the frame of training, and their image files; distortion is left out."""
+    """C pinhole cameras in the frame of training; distortion is left out."""
 
     camera_to_worlds: Tensor  # OpenGL axes (x right, y up, z backward). [C, 3, 4]
     Ks: Tensor  # Intrinsics in px. [C, 3, 3]
     sizes: list[tuple[int, int]]  # Widths and heights in px
-    photos: list[Path]
 
 
 _CLASS = "<class>"  # Key of an object's class in its mapping
@@ -124,5 +123,4 @@ def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
         for similarity in (Similarity.of(transform).inverse(), from_data(run / TRANSFORMS_NAME)):
             poses = similarity.poses(poses)
     sizes = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
-    Ks = cameras.get_intrinsics_matrices()
-    return RunCameras(torch.from_numpy(poses).float(), Ks, sizes, outputs.image_filenames)
+    return RunCameras(torch.from_numpy(poses).float(), cameras.get_intrinsics_matrices(), sizes)

@@ -9,11 +9,9 @@ All nine are linear in two numbers per Gaussian and pixel: the weight of the Gau
 exponent σ. A colour's gradient is the weights times the pixels' gradients; those of centre, conic and opacity follow
 from the moments of σ's gradient over the tile. Both are products of [Gaussians, pixels] matrices.
 
-Accuracy, relative to the norm of a gradient: as gsplat's, but for two. The moments are about the tile's centre, up to
-3.5 px from a Gaussian's along each axis, and moving them there cancels in float32: the conics of Gaussians of standard
-deviation s err by about 1e-6 px²/s². That is 3e-6 for the smallest that gsplat's blur leaves, of 0.55 px, and 3e-4 for
-Gaussians of 0.05 px, which only other projections make. A pixel's share of the absolute gradient is rounded to 11 bits,
-an error of 5e-4 at most and 2e-4 on average, which shrinks as a Gaussian covers more pixels: 1e-4 from 0.55 px.
+Gradients are as accurate as gsplat's, but for two. Moments are moved from the tile's centre to the Gaussian's: conics
+of Gaussians of standard deviation s err by about 1e-6 px²/s², at most 3e-6 behind gsplat's blur. A pixel's share of the
+absolute gradient is rounded to 11 bits, an error of 2e-4 on average, which shrinks as a Gaussian covers more pixels.
 """
 
 from __future__ import annotations

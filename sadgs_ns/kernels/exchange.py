@@ -28,7 +28,6 @@ def _pack(
     places, means2d, conics, opacities, colors, depths, radii, packed, n,
     PER_GAUSSIAN: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Write the rows of the Gaussians at some places."""
     row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)[:, None]
     k = tl.arange(0, COLUMNS)[None, :]
     exists = row < n

@@ -1,16 +1,7 @@
 """The largest sizes that the kernels can address, and their checks.
 
 Addresses are computed in 64 bits, except where that would cost registers or where gsplat's own kernels, which run in
-between, have 32. What remains limited, with C views in one step, N Gaussians and images of H × W px:
-
-| What | Largest | Because of |
-| --- | --- | --- |
-| C · N | MAX_ROWS | `compositing` and `harmonics` address rows of three numbers in 32 bits, as gsplat does |
-| C · H · W in one step | MAX_ROWS | `compositing` and `losses` do so with pixels |
-| H · W of an image with a structure tensor | MAX_ROWS | `structure_tensor` counts one image's pixels in 32 bits |
-| pairs of a Gaussian and a tile | MAX_PAIRS | lists of tiles, here and in gsplat, hold their places in 32 bits |
-| C, and images times channels of one batch | MAX_BLOCKS | CUDA launches no more blocks along an axis |
-| H | MAX_HEIGHT | the same: two rows of an image are a block of `structure_tensor` |
+between, have 32.
 """
 
 from __future__ import annotations
@@ -18,10 +9,13 @@ from __future__ import annotations
 from sadgs_ns.errors import InputError
 
 MAX_ROWS = (2**31 - 256) // 3
-"""715,827,797. A block of 256 numbers that begins below three times this ends within 32 bits."""
+"""Most Gaussians, and most pixels, of all views of a step, and most pixels of an image with a structure tensor:
+rows of three numbers are addressed in 32 bits. A block of 256 numbers that begins below three times this ends there."""
 MAX_PAIRS = 2**31 - 1
+"""Most pairs of a Gaussian and a tile: lists of tiles, here and in gsplat, hold their places in 32 bits."""
 MAX_BLOCKS = 2**16 - 1
-MAX_HEIGHT = 2 * MAX_BLOCKS
+"""Most views, and most images times channels: CUDA launches no more blocks along an axis."""
+MAX_HEIGHT = 2 * MAX_BLOCKS  # Two rows of an image are a block of `structure_tensor`.
 
 
 def _check_limit(limit: int, size: int, what: str, remedy: str) -> None:

@@ -25,7 +25,6 @@ _LANES = 128  # Gaussians that one program handles
 
 @triton.jit
 def _symmetric_times(xx, xy, xz, yy, yz, zz, x, y, z):
-    """Multiply a symmetric matrix by a vector."""
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
 
 

@@ -63,7 +63,6 @@ def _observe(
     HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
-    """Observe LANES Gaussians in all views."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = g < n
     x, y, z = load3(means, 3 * g, candidate)

@@ -13,9 +13,6 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
-Box = tuple[float, float, float, float, float, float]
-"""Lowest x, y and z, then highest x, y and z."""
-
 _SEEN = 1 / 255
 """Pixels: a view sees a Gaussian that makes up at least this much of its image, the smallest opacity that is drawn."""
 
@@ -27,7 +24,8 @@ class Cleaning:
     min_views: int = 0  # Take away Gaussians that fewer training views see; 0 takes none
     max_extent: float | None = None
     """Take away Gaussians whose longest standard deviation is more than this, in world units; None takes none."""
-    crop: Box | None = None  # Take away Gaussians whose centre is outside this box, in world units; None takes none
+    crop: tuple[float, ...] | None = None
+    """Take away Gaussians whose centre is outside this box: lowest x, y and z, then highest, in world units."""
     dust: float = 0.0
     """Take away Gaussians that make up less than this, in pixels, of the image of every training view; 0 takes none."""
 

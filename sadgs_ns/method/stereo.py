@@ -85,9 +85,7 @@ def depth_maps(
     masks: Sequence[Tensor | None] | None = None,
     device: torch.device | str,
 ) -> list[DepthMap]:
-    """Compute a depth map with confidence for each view of a capture.
-
-    Nothing is random. Raises ValueError if an image or a mask has another shape or type, or their numbers differ.
+    """Compute a depth map with confidence for each view of a capture. Nothing is random.
 
     Args:
         images: Returns a view's image, which may lie anywhere and have any size. uint8, or floating point in [0, 1].
@@ -103,8 +101,6 @@ def depth_maps(
     """
     count, device = len(viewmats), torch.device(device)
     masks = [None] * count if masks is None else masks
-    if not len(Ks) == len(masks) == count:
-        raise ValueError(f"there are {count} viewmats, but {len(Ks)} Ks and {len(masks)} masks")
     # In float64, since positions may be far from the origin, and on the host, which needs the numbers.
     viewmats, Ks = viewmats.to("cpu", torch.float64), Ks.to("cpu", torch.float64, copy=True)
     pyramids, sizes = [], torch.zeros((count, 2), dtype=torch.float64)
@@ -165,11 +161,6 @@ def choose_neighbours(
 
 def _pyramid(image: Tensor, mask: Tensor | None, device: torch.device) -> list[Tensor]:
     """Reduce an image [H, W, 3 or 4] and its mask, bool [H, W], to `_View.levels`."""
-    known = image.dtype == torch.uint8 or image.is_floating_point()
-    if not known or image.dim() != 3 or image.shape[2] not in (3, 4):
-        raise ValueError(f"images must be uint8 or float [H, W, 3 or 4], got {image.dtype} {tuple(image.shape)}")
-    if mask is not None and (mask.shape != image.shape[:2] or mask.dtype != torch.bool):
-        raise ValueError(f"masks must be bool {tuple(image.shape[:2])}, got {mask.dtype} {tuple(mask.shape)}")
     scale = 1 / 255 if image.dtype == torch.uint8 else 1.0
     image = image.to(device).to(torch.float32) * scale
     grey, valid = image[..., :3].mean(dim=2), image.new_ones(image.shape[:2], dtype=torch.bool)  # [H, W]

@@ -42,18 +42,9 @@ FINAL_PRUNE_OPACITY = 0.1
 class StructureAwareStrategy(Strategy):
     """Structure-aware densification: split where η says so, in one step, into an anisotropic grid.
 
-    A gsplat `Strategy`. Iterations are counted from 1: `step` s is iteration s + 1. In a training loop:
-
-        strategy = StructureAwareStrategy().for_run(num_iterations)
-        state = strategy.initialize_state(scene_scale)
-        renders, alphas, info = rasterization(..., packed=False, absgrad=strategy.needs_absgrad(step))
-        info |= {"structure_tensors": ..., "viewmats": ..., "Ks": ...}   # [C, H, W, 3], [C, 4, 4], [C, 3, 3]
-        strategy.step_pre_backward(params, optimizers, state, step, info)
-        loss.backward()                                                  # the mean over the C views
-        ...                                                              # the optimizers step
-        strategy.step_post_backward(params, optimizers, state, step, info)
-
-    `docs/strategy.md` holds the whole loop. Where views of different sizes are rendered, `info` lists their infos.
+    A gsplat `Strategy`, whose training loop stands in docs/strategy.md. Iterations are counted from 1: `step` s is
+    iteration s + 1. `info` is gsplat's of the C views of a step, unpacked, with `structure_tensors` [C, H, W, 3],
+    `viewmats` [C, 4, 4] and `Ks` [C, 3, 3]. Where views of different sizes are rendered, it lists their infos.
     """
 
     max_gaussians: int = 4_000_000

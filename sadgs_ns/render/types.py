@@ -32,16 +32,14 @@ class Gaussians(NamedTuple):
 
 
 class Cameras(NamedTuple):
-    """Pinhole cameras with images of one size."""
+    """Pinhole cameras with images of width × height px."""
 
     viewmats: Tensor
     """World to camera, rigid, OpenCV axes (x right, y down, z forward). [C, 4, 4]"""
     Ks: Tensor
     """Intrinsics in px. [C, 3, 3]"""
     width: int
-    """px."""
     height: int
-    """px."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ DEFAULTS = RenderOptions()
 
 
 class Projected(NamedTuple):
-    """Gaussians as cameras see them, which are drawn in a view where their radii are positive."""
+    """Gaussians as cameras of width × height px see them; they are drawn in a view where their radii are positive."""
 
     radii: Tensor
     """px, int32 [C, N] of gsplat 1.4 or [C, N, 2] of 1.5. Where one is not positive, other tensors mean nothing."""
@@ -86,9 +84,7 @@ class Projected(NamedTuple):
     colors: Tensor
     """[C, N, D]"""
     width: int
-    """Of the images, px."""
     height: int
-    """px."""
     tiles: Any = None
     """Tile lists that the Triton backend has begun (`kernels.tiles.PendingTiles`)."""
 

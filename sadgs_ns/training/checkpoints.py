@@ -49,7 +49,7 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     """Return the checkpoints that nerfstudio's options for resuming name, in the order to try them.
 
     `load_dir` is the folder of a run, or its folder of checkpoints; without `load_step` the latest one comes first.
-    Raises InputError if both a folder and a file are given, one does not exist, or the folder holds other files, too.
+    Raises InputError if both a folder and a file are given, or one does not exist.
     """
     if load_dir is None:
         if load_checkpoint is None:
@@ -76,20 +76,13 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
         raise InputError(f"{load_dir} is a file: give it to --load-checkpoint instead of --load-dir.")
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
-    steps, others = {}, []
-    for path in sorted(load_dir.iterdir()) if load_dir.is_dir() else []:
-        match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
-        if match is None:
-            others.append(path)
-        else:
-            steps[int(match[1])] = path
+    files = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in sorted(load_dir.glob("*")))
+    steps = {int(match[1]): path for match, path in files if match}
     if not steps:
         below = [path.parent for depth in ("*", "*/*", "*/*/*") for path in load_dir.glob(f"{depth}/{_FOLDER}")]
         latest = max(below, key=lambda run: (run / _FOLDER).stat().st_mtime, default=None)
         example = "" if latest is None else f", such as {latest}"
         raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
-    if others:
-        raise InputError(f"{others[0]} lies among the checkpoints and is none: move it elsewhere.")
     return steps
 
 

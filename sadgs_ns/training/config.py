@@ -51,7 +51,7 @@ def _class(module: str, name: str) -> type:
 @hide("trans_l2_penalty", "rot_l2_penalty")
 @dataclass
 class PoseOptimizerConfig(CameraOptimizerConfig):
-    """nerfstudio's options of learned camera poses, with its own penalties, which hold them near the given ones."""
+    """nerfstudio's options of learned camera poses."""
 
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
     """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
@@ -130,10 +130,6 @@ class SadgsModelConfig(InstantiateConfig):
             ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
         ]
         check_ranges("pipeline.model.", self, ranges)
-        for name in ("trans_l2_penalty", "rot_l2_penalty"):
-            given, kept = getattr(self.camera_optimizer, name), getattr(PoseOptimizerConfig, name)
-            allowed = [(name, given == kept, f"{kept:g}, as in nerfstudio")]
-            check_ranges("pipeline.model.camera_optimizer.", self.camera_optimizer, allowed)
         try:
             self.strategy.check()
         except ValueError as error:

@@ -126,7 +126,6 @@ class StructurePanel(torch.nn.Module):
         return f"{self._status}\n\n{text}" if self._status else text
 
     def _say(self, status: str) -> None:
-        """Show above the table what the panel does or has done."""
         self._status = status
         self.table.refresh()
 

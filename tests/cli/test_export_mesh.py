@@ -156,7 +156,7 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
     }
     pose = torch.eye(4)[None, :3]
     K = torch.tensor([[[40.0, 0, 16], [0, 40, 16], [0, 0, 1]]])
-    cameras = meshing.RunCameras(pose, K, [(32, 32)], [Path("a.png")])
+    cameras = meshing.RunCameras(pose, K, [(32, 32)])
     (view,) = meshing.render_depths(params, cameras, [0], RenderOptions(max_off_axis=0.0))
     assert view.depth[16, 16] == pytest.approx(2.0) and view.depth[0, 0] == 0
     alpha = 0.8 * np.exp(-0.5 * ((np.arange(32) + 0.5 - 16) ** 2) / ((0.3 * 20) ** 2 + 0.3))
@@ -190,7 +190,7 @@ def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
 @pytest.mark.usefixtures("open3d")
 def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
     params, _ = export.read_checkpoint(run[1])
-    nowhere = meshing.RunCameras(torch.zeros(0, 3, 4), torch.zeros(0, 3, 3), [], [])
+    nowhere = meshing.RunCameras(torch.zeros(0, 3, 4), torch.zeros(0, 3, 3), [])
     with pytest.raises(InputError, match=r"^The capture has no training views to fuse .* give another with --data\.$"):
         meshing.write_mesh(tmp_path / "a.mesh.ply", params, nowhere)
     params["opacities"] = torch.full_like(params["opacities"], -6.0)

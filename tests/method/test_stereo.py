@@ -142,17 +142,6 @@ def test_nothing_is_known_without_texture_neighbours_or_points():
             assert not depth_map.depth.any() and not depth_map.confidence.any()
 
 
-def test_arguments_that_do_not_fit_are_named():
-    images, viewmats, Ks, points = capture(count=2)
-    mask = torch.ones((HEIGHT, WIDTH), dtype=torch.bool)
-    for masks in ([mask], [mask, mask[1:]], [mask, 1 * mask]):
-        with pytest.raises(ValueError, match="masks"):
-            depth_maps(images.__getitem__, viewmats, Ks, points, masks=masks, device="cpu")
-    for image in (images[0][..., :2], images[0][..., 0], images[0].int()):
-        with pytest.raises(ValueError, match="images must be"):
-            depth_maps([image, image].__getitem__, viewmats, Ks, points, device="cpu")
-
-
 def test_neighbours_see_the_same_points_from_good_angles():
     y, x = torch.meshgrid(torch.linspace(-20, 20, 40), torch.linspace(-30, 30, 60), indexing="ij")
     points = torch.stack([x, y, torch.full_like(x, 10)], dim=2).flatten(0, 1)[::2].double()

@@ -232,11 +232,6 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
         ("initial_opacity", 1.0, "pipeline.model.initial_opacity must be in (0, 1), got 1."),
         ("opacity_reg", -1.0, "pipeline.model.opacity_reg must be in [0, 100], got -1."),
         ("opacity_reg", float("inf"), "pipeline.model.opacity_reg must be in [0, 100], got inf."),
-        (
-            "camera_optimizer",
-            PoseOptimizerConfig(rot_l2_penalty=float("nan")),
-            "pipeline.model.camera_optimizer.rot_l2_penalty must be 0.001, as in nerfstudio, got nan.",
-        ),
     ],
 )
 def test_options_of_the_model_that_are_out_of_range_are_refused(option: str, value: Any, sentence: str):

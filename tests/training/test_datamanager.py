@@ -353,18 +353,6 @@ def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp
     assert positions.tolist() == POSITIONS.tolist() and colors.tolist() == COLORS.tolist()
 
 
-@pytest.mark.hard_case("a PLY of PCL, which packs a colour into one number, rgb or rgba", "read")
-@pytest.mark.parametrize("name", ["rgb", "rgba"])
-def test_packed_colours_are_read(name: str, tmp_path: Path):
-    bits = ((COLORS[:, 0] << 16) | (COLORS[:, 1] << 8) | COLORS[:, 2]).astype(np.uint32)
-    values = bits.view(np.float32) if name == "rgb" else bits | np.uint32(255 << 24)
-    vertices = np.array(
-        list(zip(*POSITIONS.T, values, strict=True)), [(axis, "<f4") for axis in "xyz"] + [(name, values.dtype)]
-    )
-    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "a.ply"))
-    assert ply.read_points(tmp_path / "a.ply")[1].tolist() == COLORS.tolist()
-
-
 @pytest.mark.hard_case("a PLY of points without colours", "trains from grey points; the check notes it")
 @pytest.mark.parametrize("colors", [None, COLORS.astype(np.uint8)], ids=["without", "with"])
 def test_points_without_colours_are_noted(colors: np.ndarray | None, tmp_path: Path):

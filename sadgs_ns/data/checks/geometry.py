@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,12 +73,9 @@ def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) 
 
 def finite(value: Any, name: str, where: str) -> float:
     """Return a JSON value that is a finite number; raise InputError if it is not."""
-    try:
-        if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
-            return value
-    except OverflowError:  # It is an integer beyond float64.
-        value = "a number beyond all bounds"
-    raise InputError(f"{where} has {name} = {value!r}, which is no finite number: correct it.")
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
+        return value
+    raise InputError(f"{where} has {name} = {value!r:.60}, which is no finite number: correct it.")
 
 
 def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:

@@ -117,11 +117,6 @@ def poses_elsewhere(data: Path) -> str | None:
 
 def no_layout(data: Path) -> str:
     """Return the sentence for a folder without poses."""
-    models = [data / folder for folder in COLMAP_FOLDERS]
-    files = [folder / f"cameras.{kind}" for folder in models for kind in ("txt", "bin")]
-    for path in (data, data / "transforms.json", data / "transforms_train.json", *models, *files):
-        if path.is_symlink() and not path.exists():
-            return f"{path} is a link that leads nowhere: put there what it should lead to."
     if not data.exists():
         return f"{data} does not exist: give --data the folder of a capture."
     if data.is_file():

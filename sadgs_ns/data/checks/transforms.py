@@ -252,7 +252,6 @@ def _camera(values: dict[str, Any], model: str, where: str) -> geometry.Camera:
 
 
 def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View]) -> Iterator[Finding]:
-    """Check the SfM points that belong to a file of poses."""
     if "ply_file_path" in meta:
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
