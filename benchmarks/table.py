@@ -87,13 +87,13 @@ def deviation(cell: Cell, name: str) -> float | None:
     return math.sqrt(sum((len(numbers) - 1) * statistics.variance(numbers) for numbers in known) / freedom)
 
 
-def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float:
-    """Loop seconds at which a run's curve first has the goal's PSNR, SSIM and LPIPS at once; infinity if it never has.
+def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float | None:
+    """Loop seconds at which a run's curve first has the goal's PSNR, SSIM and LPIPS at once.
 
-    Raises ValueError if the run was not measured on its way.
+    Infinity if it never has, None if the run was not measured on its way.
     """
     if not run.get("curve"):
-        raise ValueError(f"{run['key']} has no curve; give its protocol curve_every.")
+        return None
     for point in run["curve"]:
         measured = [(point[name], goal[name], name) for name in DIGITS if goal[name] is not None]
         if all(here is not None and (here <= end if name == "lpips" else here >= end) for here, end, name in measured):
@@ -142,8 +142,10 @@ class Run:
         for group, base in zip(self.cell, self.base, strict=False):
             goal = {name: mean(base, name) for name in DIGITS}
             found += [seconds_to_match(run, run if any(run is other for other in base) else goal) for run in group]
-        seconds = statistics.median(found) if found else math.inf
-        return NOTHING if math.isinf(seconds) else number(seconds, 0 if seconds >= 100 else 1)
+        if None in found or not found:
+            return NOTHING
+        seconds = statistics.median(value for value in found if value is not None)
+        return "never" if math.isinf(seconds) else number(seconds, 0 if seconds >= 100 else 1)
 
     def views(self) -> list[list[float]]:
         """PSNR of each held-out view of all scenes, over the seeds; raises ValueError if a run does not tell it."""

@@ -20,7 +20,7 @@ OLDEST_TRITON = (3, 5)
 
 TILE_SIZE = 8
 """Side of our rasterizer's tiles in px. gsplat's default of 16 saves list entries; with exact lists, saved pixels
-matter more (docs/results.md#parts-of-a-step). A tile has one warp, and each of its lanes two pixels."""
+matter more. A tile has one warp, and each of its lanes two pixels."""
 SWITCH = "SADGS_TRITON"
 """Environment variable; 0 keeps a process from using the kernels."""
 

@@ -1,7 +1,7 @@
 """The length of a run, the views of a step, and the times of densification, derived from the capture.
 
 A *view visit* is one rendering of one training view with its gradients. Many visits to few views overfit, and few
-visits to many underfit, so that the number of visits follows the number of views (docs/results.md#schedule).
+visits to many underfit, so that the number of visits follows the number of views (docs/results.md#why-these-defaults).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ GROWTH_WITH_EFFORT = (-0.32, 0.8)
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
-"""Iterations of the shortest run that resets opacities: shorter ones lost 2.7 to 11 dB (docs/results.md#short-runs)."""
+"""Iterations of the shortest run that resets opacities: shorter ones lost 2.7 to 11 dB (docs/results.md)."""
 _PARTS = 30  # A run is divided into so many parts of as many whole iterations
 _WINDOWS = {
     "structure_every": 5,

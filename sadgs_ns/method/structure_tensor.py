@@ -26,7 +26,7 @@ INTEGRATION_FACTOR = 3.0
 GAMMA = 3.0
 """γ, the exponent of the scale weights E_l^γ (paper, eq. 5)."""
 FREQUENCY_CONSTANT = 0.75
-"""c of ω_l = c / σ_l, in 1/px, which the paper leaves open (docs/results.md#frequency-votes-and-children)."""
+"""c of ω_l = c / σ_l, in 1/px, which the paper leaves open (docs/results.md#why-these-defaults)."""
 NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
 ENERGY_BLUR = 2.0

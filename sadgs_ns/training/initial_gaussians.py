@@ -20,7 +20,7 @@ from sadgs_ns.training.progress import warn
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
-brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#other-constants)."""
+brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
 
 
 def initial_gaussians(

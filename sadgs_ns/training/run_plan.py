@@ -15,9 +15,8 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.optimizers import RunLengthDecaySchedulerConfig
 
 RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
-"""Factors on learning rates at the first and at the last iteration in steps of four views
-(docs/results.md#splits-and-rates). Rates that fall after densification fall less in steps of several views, and not at
-all in steps of four."""
+"""Factors on learning rates at the first and at the last iteration in steps of four views. Rates that fall after
+densification fall less in steps of several views, and not at all in steps of four."""
 _HEAD = "# What was decided for this run before its first step; config.yml says what was asked for.\n"
 
 
