@@ -34,7 +34,7 @@ from examples.drawn_scene.scene import write_scene
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "yaml", "{button-link}"}
 """Of fenced blocks that hold no commands."""
-FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-install-cli", "apt install")
+FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-install-cli")
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""
 RUN_BY = {
     "make test": ".ci/run",
@@ -63,7 +63,6 @@ RUN_BY = {
 SHORTER = {
     "ns-train sadgs": "--max-num-iterations 2 --vis tensorboard",
     "python -m examples.drawn_scene": "--width 40 --height 30 --views 9 --max-num-iterations 30",
-    "python -m examples.drawn_scene.scene": "--width 40 --height 30 --views 16",
 }
 """Options with which commands that begin so are run here, beside those that they have and in place of these."""
 
