@@ -105,9 +105,11 @@ class Source:
         runs += [(run, False) for line in elsewhere for run in self.lines(**line)]
         return [[(run.name, here, *map(run.mean, ("loop_seconds", "psnr", "lpips"))) for run, here in runs]]
 
-    def quality_drawn(self, rows: str) -> list[Any]:
+    def quality_drawn(self, rows: str, scenes: Sequence[str], labels: Mapping[str, str]) -> list[Any]:
         """Arguments of `plots.quality`."""
-        return [list(table.groups(self.read(rows)).items())]
+        found = table.groups(self.read(rows))
+        named = [(scene, label, name) for scene in scenes for label, name in labels.items()]
+        return [[((scene, name), table.group_of(found, scene, label)) for scene, label, name in named]]
 
 
 def folds_of(scenes: Scenes) -> Mapping[str, Sequence[str]]:

@@ -57,7 +57,7 @@ def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 @_styled
-def quality(results: Iterable[tuple[tuple[str, str], list[Result]]]) -> Figure:
+def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]]) -> Figure:
     """PSNR, SSIM and LPIPS of scenes and labels against loop seconds, a row of panels a scene.
 
     Runs that were measured on their way have lines.
@@ -83,7 +83,7 @@ def quality(results: Iterable[tuple[tuple[str, str], list[Result]]]) -> Figure:
     rows = [row for group in groups.values() for row in group]
     line = "-" if any(row.get("curve") for row in rows) else ""
     handles = [Line2D([], [], **look, linestyle=line, label=label) for label, look in looks.items()]
-    shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows)
+    shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows if row.get("loop_seconds") is not None)
     _finish_figure(figure, "runs shared a GPU: times are not comparable" if shared else "← less is better", handles)
     return figure
 
@@ -164,7 +164,7 @@ def _plot(axes: Axes, points: Points, **looks: Any) -> None:
         axes.plot(*zip(*points, strict=True), **looks)
 
 
-def _curve(group: list[Result], metric: str) -> Points:
+def _curve(group: Sequence[Result], metric: str) -> Points:
     """Mean (seconds, metric) at the steps that all of a group's curves have, the last of which is the run's end."""
     curves = [{point["step"]: point for point in row["curve"]} for row in group if row.get("curve")]
     points = (
