@@ -44,7 +44,7 @@ _ADJUSTMENT = {
     "ba_local_max_refinements": 1, "ba_global_max_refinements": 2,
 }  # fmt: skip
 """Growth of a model until all of it is adjusted again, the relative change of the cost at which an adjustment ends, and
-how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5 (docs/results.md#finding-cameras)."""
+how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5."""
 _ADJUSTED_PHOTOS = 2  # Photos that are adjusted after each that is placed; COLMAP's own are 6
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
