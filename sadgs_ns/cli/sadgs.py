@@ -29,8 +29,7 @@ from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
-from sadgs_ns.cli.status_line import StatusLine, clock
-from sadgs_ns.cli.timeline import Timeline
+from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
 from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings

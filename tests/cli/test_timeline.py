@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from sadgs_ns.cli import timeline
-from sadgs_ns.cli.timeline import Timeline
+from sadgs_ns.cli import status_line
+from sadgs_ns.cli.status_line import Timeline
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time, which stands still; its one element may be changed."""
     now = [1000.0]
-    monkeypatch.setattr(timeline.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(status_line.time, "monotonic", lambda: now[0])
     return now
 
 
