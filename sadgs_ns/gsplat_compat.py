@@ -28,22 +28,13 @@ SCREEN_BLUR = 0.3
 """What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²."""
 
 
-def has_radius_per_axis(
-    radii: Tensor,  # [C, N] or [C, N, 2]; packed: [nnz] or [nnz, 2]
-    means2d: Tensor,  # [C, N, 2]; packed: [nnz, 2]
-) -> bool:
-    """Tell whether Gaussians have a radius along x and one along y (gsplat 1.5) or one radius (gsplat 1.4).
-
-    The ranks are compared since packed radii of 1.5 [nnz, 2] look like unpacked ones of 1.4 [C, N].
-    """
+def has_radius_per_axis(radii: Tensor, means2d: Tensor) -> bool:
+    """Tell whether `Projected` Gaussians have a radius along x and one along y (gsplat 1.5) or one radius (1.4)."""
     return radii.dim() == means2d.dim()
 
 
-def drawn(
-    radii: Tensor,  # [C, N] or [C, N, 2]; packed: [nnz] or [nnz, 2]
-    means2d: Tensor,  # [C, N, 2]; packed: [nnz, 2]
-) -> Tensor:
-    """Tell which Gaussians gsplat drew: all their radii are positive. bool [C, N]; packed: [nnz]"""
+def drawn(radii: Tensor, means2d: Tensor) -> Tensor:
+    """Tell which `Projected` Gaussians gsplat drew: all their radii are positive. bool [C, N]"""
     positive = radii > 0
     return positive.all(dim=-1) if has_radius_per_axis(radii, means2d) else positive
 

@@ -115,15 +115,6 @@ def _check_cuda() -> Iterator[Finding]:
         yield note("gsplat has its CUDA kernels.")
 
 
-def check_all(data: Path | None) -> Iterator[Finding]:
-    """Check the machine and, if one is given, a data folder."""
-    yield from check_machine()
-    if data is not None:
-        yield from (findings := check_data(data))
-        if all(finding.severity == "note" for finding in findings):
-            yield note(f"{data}: nothing to complain about.")
-
-
 @dataclass
 class Doctor:
     """Print what this machine offers to training and what a data folder holds, and check both. The exit code is 1 if
@@ -139,9 +130,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(", ".join(f"{package} {number}" for package, number in versions().items()))
     print(f"note: Free disk space here: {free_space(Path())}.", flush=True)
     failed = False
-    for finding in check_all(data):
-        print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
-        failed |= finding.severity == "error"
+    for check in (check_machine, lambda: [] if data is None else check_data(data)):
+        for finding in check():
+            print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
+            failed |= finding.severity == "error"
     if data is not None and not failed:
         print(f"Next: ns-train sadgs --data {shlex.quote(str(data))}")
     return int(failed)

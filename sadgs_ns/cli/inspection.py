@@ -69,9 +69,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
         raise InputError(f"{path} is {method}: give one of a method whose name begins with sadgs.")
     folder = path.parent / config.relative_model_dir
     if not any(folder.glob("*")):
-        raise InputError(
-            f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500 to look on the way."
-        )
+        raise InputError(f"{folder} holds no checkpoint yet: train to the end, or with --steps-per-save 500.")
     chosen = checkpoints.read_chosen(folder, load_step, None, _REMEDY)
     assert chosen is not None
     checkpoint, state = chosen

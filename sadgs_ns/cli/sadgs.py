@@ -125,10 +125,8 @@ class PhotosToSplat:
         decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
         differing = [name for name in decided if begun.get(name) != asked[name]]
         if differing:
-            changes = [f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing]
-            raise InputError(
-                f"{folder} was begun with other settings ({'; '.join(changes)}); give another --output or delete it."
-            )
+            told = "; ".join(f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing)
+            raise InputError(f"{folder} was begun with other settings ({told}); give another --output or delete it.")
         self._settings = begun | asked
 
     def _note(self, **settings: Any) -> None:

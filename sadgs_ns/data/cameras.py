@@ -32,10 +32,9 @@ def check_camera_types(cameras: Cameras) -> None:
         if camera_type in _UNDISTORTED and (coefficients is None or not coefficients[index].any()):
             raise InputError(f"{where} {NO_COEFFICIENTS}")
         if camera_type not in (CameraType.PERSPECTIVE, *_UNDISTORTED):
-            raise InputError(
-                f"{where}, which sadgs cannot render: it renders PERSPECTIVE cameras only. Make perspective images of "
-                "it (ns-process-data does so with --camera-type equirectangular)."
-            )
+            problem = f"{where}, which sadgs cannot render: it renders PERSPECTIVE cameras only"
+            remedy = "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)"
+            raise InputError(f"{problem}. {remedy}.")
 
 
 def check_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
@@ -49,7 +48,6 @@ def check_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
     fits = (focals > 0.01 * sizes) & (centers > 0) & (centers < sizes)  # 1 % is a field of view of 179°
     of_fisheye = (cameras.camera_type == torch.tensor([t.value for t in _UNDISTORTED]).to(cameras.camera_type)).any(-1)
     for index in (of_fisheye & ~fits.all(dim=-1)).nonzero().flatten().tolist():
-        raise InputError(
-            f"{names[index]} is a FISHEYE image that nerfstudio could not undistort, for its field of view is "
-            "too close to 180°: crop it, or undistort it yourself."
-        )
+        problem = f"{names[index]} is a FISHEYE image that nerfstudio could not undistort"
+        why = "its field of view is too close to 180°"
+        raise InputError(f"{problem}, for {why}: crop it, or undistort it yourself.")

@@ -88,10 +88,8 @@ class Similarity:
 def spherical_harmonics(directions: Array, degree: int) -> Array:
     """Return the real, orthonormal spherical harmonics of unit vectors, in the order and with the signs of 3DGS.
 
-    Raise ValueError if the highest degree is not 0 … 3. [..., 3] → [..., (degree + 1)²]
+    The highest degree is 0 … 3. [..., 3] → [..., (degree + 1)²]
     """
-    if not 0 <= degree <= 3:
-        raise ValueError(f"spherical harmonics of degree {degree}: only 0 to 3 are known")
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
 
     def root(numerator: float, denominator: float) -> float:

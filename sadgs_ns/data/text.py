@@ -20,6 +20,5 @@ def read_text(path: Path) -> str:
 def check_byte_order_mark(text: str, path: Path) -> None:
     """Raise InputError if the text of a file, or its first line, starts with a byte order mark."""
     if text.startswith("\ufeff"):
-        raise InputError(
-            f"{path} starts with a byte order mark, which nerfstudio cannot read: save it as UTF-8 without one."
-        )
+        problem = f"{path} starts with a byte order mark, which nerfstudio cannot read"
+        raise InputError(f"{problem}: save it as UTF-8 without one.")

@@ -24,34 +24,23 @@ _MOST_POINTS = 2**17  # Of more points, so many are looked at, since a point in 
 _PAIRS = 2**24  # Pairs of a pose and a point that are computed at a time, in arrays of 64 MB
 
 
-def nearest_depths(
+def scene_near_plane(
     points: Tensor,  # [P, 3]
     viewmats: Tensor,  # [C, 4, 4]
     Ks: Tensor,  # [C, 3, 3]
     sizes: Tensor,  # [C, 2]
-) -> Tensor:
-    """Measure the depth of the `NEAREST_POINTS`-th SfM point before each view, given arguments of `depths_in_views`.
-
-    It is along the viewing axis, in world units, > 0, and infinite in views that see fewer points. [C]
-    """
-    points = points[plausible_points(points)]
-    if len(points) < NEAREST_POINTS:
-        return points.new_full((len(viewmats),), torch.inf)
-    points = points[:: -(-len(points) // _MOST_POINTS)]  # [P, 3]
-    cameras = (tensor.split(max(_PAIRS // len(points), 1)) for tensor in (viewmats, Ks, sizes))
-    depths = (depths_in_views(points, *some) for some in zip(*cameras, strict=True))  # each [c, P]
-    return torch.cat([some.kthvalue(NEAREST_POINTS, dim=1).values for some in depths])
-
-
-def scene_near_plane(
-    depths: Tensor,  # [C]
     extent: float,
 ) -> float:
-    """Derive the near plane of a scene, > 0, from the `nearest_depths` of its training cameras.
+    """Derive the near plane of a scene, > 0, given arguments of `depths_in_views` and `initialization.camera_extent`.
 
-    The camera that is nearest to anything decides. `extent` is `initialization.camera_extent`.
+    The training camera that is nearest to anything decides, by the depth of its `NEAREST_POINTS`-th SfM point.
     """
-    nearest = float(depths.min())
+    points, nearest = points[plausible_points(points)], math.inf
+    if len(points) >= NEAREST_POINTS:
+        points = points[:: -(-len(points) // _MOST_POINTS)]  # [P, 3]
+        cameras = (tensor.split(max(_PAIRS // len(points), 1)) for tensor in (viewmats, Ks, sizes))
+        depths = (depths_in_views(points, *some) for some in zip(*cameras, strict=True))  # each [c, P]
+        nearest = min(float(some.kthvalue(NEAREST_POINTS, dim=1).values.min()) for some in depths)
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent
 
 

@@ -14,15 +14,6 @@ _LEAST_LIMIT = 1e-7
 """World units. A Gaussian around a camera's very centre keeps this size, so that its logarithm is finite."""
 
 
-def clear_of_cameras(
-    means: Tensor,  # [N, 3]
-    radii: Tensor,  # [N]
-    positions: Tensor,  # [C, 3]
-) -> Tensor:
-    """Which points have no camera nearer than their radius, all in world units. bool [N]"""
-    return _distances(means, positions) >= radii
-
-
 @torch.no_grad()
 def limit_scales(
     scales: Tensor,  # [N, 3]
@@ -35,12 +26,15 @@ def limit_scales(
     `scales` are the parameters, logarithms of the standard deviations, and `angular_scale` > 0 is the largest standard
     deviation as a share of that distance. The host does not wait for the device.
     """
-    limits = (angular_scale * _distances(means, positions)).clamp_min(_LEAST_LIMIT).log()  # [N]
+    limits = (angular_scale * camera_distances(means, positions)).clamp_min(_LEAST_LIMIT).log()  # [N]
     scales.copy_(torch.minimum(scales, limits[:, None]))
 
 
-def _distances(means: Tensor, positions: Tensor) -> Tensor:
-    """Return the distance of each point from the nearest camera. [N, 3], [C, 3] → [N]
+def camera_distances(
+    means: Tensor,  # [N, 3]
+    positions: Tensor,  # [C, 3]
+) -> Tensor:
+    """Return the distance of each point from the nearest camera, in world units. [N]
 
     One axis is added at a time: matrix products cancel far from the origin, and without them `torch.cdist` is slow.
     """

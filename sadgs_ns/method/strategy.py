@@ -254,7 +254,11 @@ class StructureAwareStrategy(Strategy):
         growth, (under_cap, in_memory) = proposal.growth, self._room(params, state, views)
         allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
         if in_memory < min(self.world.sums(int(growth.sum()))[0], under_cap):
-            _warn_of_memory(iteration, in_memory)
+            warnings.warn(
+                f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are "
+                "added. Lower max_gaussians, use smaller images, or end other programs on the device.",
+                stacklevel=2,
+            )
         apply(proposal, allowed, params, optimizers, state)
         if by_eta:
             # The statistics of parents say nothing about their children.
@@ -304,11 +308,3 @@ def empty_state(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
 
 def _views(info: Infos) -> Sequence[Info]:
     return [info] if isinstance(info, Mapping) else info
-
-
-def _warn_of_memory(iteration: int, in_memory: float) -> None:
-    warnings.warn(
-        f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are added. "
-        "Lower max_gaussians, use smaller images, or end other programs on the device.",
-        stacklevel=2,
-    )

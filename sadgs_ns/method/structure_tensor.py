@@ -106,7 +106,12 @@ def multiscale_structure_tensor(
         smallest = torch.finfo(image.dtype).tiny
         trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
         weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
-    correlate, differentiate, aggregate = _operations(image)
+    correlate, differentiate, aggregate = _correlate, _differentiate, _aggregate
+    if use_triton(image):
+        from sadgs_ns.kernels import limits
+        from sadgs_ns.kernels.structure_tensor import aggregate, correlate, differentiate
+
+        limits.check_batch(*image.shape)
     # Without masks all images have the same weights.
     sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
@@ -206,16 +211,6 @@ class _WeightedSums:
 
     def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
         return self.correlate(image, gaussian_kernel(sigma, order, image.dtype, image.device), axis)
-
-
-def _operations(image: Tensor) -> tuple[Callable[..., Tensor], Callable[..., tuple[Tensor, Tensor, Tensor]], Callable]:
-    """The operations `_correlate`, `_differentiate` and `_aggregate`, by Triton where it runs."""
-    if not use_triton(image):
-        return _correlate, _differentiate, _aggregate
-    from sadgs_ns.kernels import limits, structure_tensor
-
-    limits.check_batch(*image.shape)
-    return structure_tensor.correlate, structure_tensor.differentiate, structure_tensor.aggregate
 
 
 def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:

@@ -84,10 +84,8 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
     if chosen == "gsplat" and device.type != "cuda":
         raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: {_REMEDY}.")
     if chosen == "gsplat" and not alone:
-        raise InputError(
-            "The backend gsplat works on one device only, and this run takes several: take one, or let Triton draw "
-            "(sadgs-doctor says whether it works)."
-        )
+        problem = "The backend gsplat works on one device only, and this run takes several"
+        raise InputError(f"{problem}: take one, or let Triton draw (sadgs-doctor says whether it works).")
     return chosen
 
 

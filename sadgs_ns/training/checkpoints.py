@@ -54,10 +54,8 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     if load_dir is None:
         if load_checkpoint is None:
             return []
-        if load_checkpoint.is_dir():
-            raise InputError(f"{load_checkpoint} is a folder: give it to --load-dir instead of --load-checkpoint.")
         if not load_checkpoint.is_file():
-            raise InputError(f"{load_checkpoint} does not exist: give --load-checkpoint a file step-*.ckpt of a run.")
+            raise InputError(f"{load_checkpoint} is no file: give --load-checkpoint one, or --load-dir a run's folder.")
         return [load_checkpoint]
     if load_checkpoint is not None:
         raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
@@ -72,8 +70,6 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
 
 def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
     """Return the checkpoints of a run's folder, or of its folder of checkpoints, by their steps."""
-    if load_dir.is_file():
-        raise InputError(f"{load_dir} is a file: give it to --load-checkpoint instead of --load-dir.")
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
     files = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in sorted(load_dir.glob("*")))

@@ -74,7 +74,5 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         patience.cancel()
     if failures:
         why = reason(next(iter(failures.values())))
-        warn(
-            f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why}): "
-            "training tries them again, and stops with an error of its own if it cannot do without them."
-        )
+        told = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why})"
+        warn(f"{told}: training tries them again, and stops with an error of its own if it cannot do without them.")

@@ -211,10 +211,8 @@ class GraphedSteps:
         self.failure = reason(error)
         self._drop()
         self._recorder = None
-        warn(
-            f"A training step could not be captured as a CUDA graph ({self.failure}): the kernels of "
-            "this run are launched one by one, which takes longer where Gaussians are few."
-        )
+        told = f"A training step could not be captured as a CUDA graph ({self.failure})"
+        warn(f"{told}: the kernels of this run are launched one by one, which takes longer where Gaussians are few.")
 
 
 def _captured_step(model: SadgsModel, inputs: _Inputs, opacity_reg: float, update: AdamUpdate) -> Results:

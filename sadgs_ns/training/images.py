@@ -77,10 +77,8 @@ class LazyImages(Sequence[dict[str, Any]]):
             raise
         except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
             masks = self._dataset._dataparser_outputs.mask_filenames is not None
-            raise InputError(
-                f"{name}{' or its mask' if masks else ''} cannot be read as an image ({reason(error)}): copy it again, "
-                "or leave it out of the reconstruction."
-            ) from error
+            problem = f"{name}{' or its mask' if masks else ''} cannot be read as an image ({reason(error)})"
+            raise InputError(f"{problem}: copy it again, or leave it out of the reconstruction.") from error
         image: Tensor = data["image"]
         if (width_and_height := (image.shape[1], image.shape[0])) != size:
             sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)

@@ -6,21 +6,14 @@ harmonics features_dc [N, 3] and features_rest [N, K, 3].
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
 from torch import Tensor
 
-from sadgs_ns.method.initialization import neighbour_scales, plausible_points, starting_points
-from sadgs_ns.method.scale_limits import clear_of_cameras
+from sadgs_ns.method.initialization import plausible_points, starting_points
 from sadgs_ns.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.progress import warn
-
-CAMERA_CLEARANCE = 2.0
-"""Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
-brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
 
 
 def initial_gaussians(
@@ -74,23 +67,3 @@ def spheres(
         "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
         "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
     }
-
-
-def outside_cameras(params: Mapping[str, Tensor], positions: Tensor) -> Tensor:
-    """Tell which Gaussians contain no camera's centre [C, 3], or all True if each contains one. bool [N]"""
-    radii = CAMERA_CLEARANCE * params["scales"].detach().exp().amax(dim=1)  # [N]
-    keep = clear_of_cameras(params["means"].detach(), radii, positions)  # [N]
-    return keep if bool(keep.any()) else torch.ones_like(keep)
-
-
-def beside(
-    known: Tensor,  # [K, 3]
-    means: Tensor,  # [P, 3]
-    colors: Tensor,  # [P, 3] in [0, 1]
-    scales: Tensor,  # [P]
-    config: SadgsModelConfig,
-) -> dict[str, Tensor]:
-    """Return the parameters of spheres no larger than these scales, or the distance to neighbours and known points."""
-    spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [P]
-    scales = torch.minimum(scales, spacing.to(scales))
-    return spheres(means, colors, scales, config.initial_opacity, sh_degree=config.sh_degree)

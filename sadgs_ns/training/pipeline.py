@@ -61,10 +61,8 @@ class SadgsPipeline(VanillaPipeline):
                 note(line)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
-            warn(
-                f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: "
-                f"consider --pipeline.model.background-color {parsed_on}."
-            )
+            told = f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}"
+            warn(f"{told}: consider --pipeline.model.background-color {parsed_on}.")
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
         self.model.set_cameras(self.datamanager.train_dataset.cameras)
@@ -193,10 +191,8 @@ class SadgsPipeline(VanillaPipeline):
         """Return the mean, and for several views the deviation, of each metric; raise InputError without views."""
         views = len(self.datamanager.eval_dataset)
         if views == 0:
-            raise InputError(
-                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
-                "--eval-mode that holds out some."
-            )
+            problem = "The run holds out no view, so that there is nothing to measure"
+            raise InputError(f"{problem}: train with one of the parser's --eval-mode that holds out some.")
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
@@ -216,10 +212,8 @@ class SadgsPipeline(VanillaPipeline):
         for name, parameter in self.named_parameters():
             value = loaded.get(name)
             if ".gauss_params." not in name and value is not None and value.shape != parameter.shape:
-                raise InputError(
-                    f"The checkpoint's {name} is for {len(value)} training views, and there are {len(parameter)}: set "
-                    "the parser's options that choose them as they were."
-                )
+                problem = f"The checkpoint's {name} is for {len(value)} training views, and there are {len(parameter)}"
+                raise InputError(f"{problem}: set the parser's options that choose them as they were.")
         super().load_pipeline(loaded_state, step)
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -123,10 +123,8 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
             "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
         )
     if requested is not None and requested > in_step:
-        warn(
-            f"pipeline.views_per_iteration is {requested}, but there are {views} training views: all are taken each "
-            "time."
-        )
+        told = f"pipeline.views_per_iteration is {requested}, but there are {views} training views"
+        warn(f"{told}: all are taken each time.")
     if pipeline.device.type == "cpu":
         told = cpu_notice(torch.get_num_threads())
         warn(told)

@@ -59,18 +59,15 @@ def check_devices(machine: MachineConfig) -> bool:
     ]
     check_ranges("machine.", machine, ranges)
     if machine.num_devices > 1 and machine.device_type != "cuda":
-        raise InputError(
-            f"machine.num_devices is {machine.num_devices}, and nerfstudio starts several processes with CUDA only: "
-            "set it to 1, or start the run with torchrun."
-        )
+        several = f"machine.num_devices is {machine.num_devices}"
+        problem = f"{several}, and nerfstudio starts several processes with CUDA only"
+        raise InputError(f"{problem}: set it to 1, or start the run with torchrun.")
     if machine.num_devices == 1 and number_of_processes() == 1:
         return False
     wanted, found = max(machine.num_devices, processes_on_this_machine()), torch.cuda.device_count()
     if machine.device_type == "cuda" and wanted > found:
-        raise InputError(
-            f"The run is to take {wanted} CUDA devices of this machine, and torch finds {found}: lower "
-            "machine.num_devices, or torchrun's --nproc-per-node."
-        )
+        problem = f"The run is to take {wanted} CUDA devices of this machine, and torch finds {found}"
+        raise InputError(f"{problem}: lower machine.num_devices, or torchrun's --nproc-per-node.")
     return True
 
 

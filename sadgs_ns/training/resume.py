@@ -66,10 +66,8 @@ class Resumption:
             extra = self.state["pipeline"]["_extra_state"]
             check_same_capture(pipeline, extra["images"], extra["camera_positions"])
             if more := sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys()):
-                raise InputError(
-                    f"It optimized {' and '.join(more)}, too: set pipeline.model.color-model and "
-                    "pipeline.model.camera-optimizer.mode as they were."
-                )
+                remedy = "set pipeline.model.color-model and pipeline.model.camera-optimizer.mode as they were"
+                raise InputError(f"It optimized {' and '.join(more)}, too: {remedy}.")
 
     def load_optimizers(self, optimizers: Optimizers, scaler: GradScaler, schedulers: bool) -> None:
         """Load the optimizers and, if asked for, their schedulers, and print from where the run goes on."""

@@ -98,10 +98,8 @@ class SadgsTrainer(Trainer):
             self.graphed = GraphedSteps(self.pipeline.model) if self._may_graph_steps() else None
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
-        except RunError:
-            raise
         except RuntimeError as error:
-            if self._peers is None or not self._peers.ended():
+            if isinstance(error, RunError) or self._peers is None or not self._peers.ended():
                 raise
             raise RunError(f"{_ANOTHER_ENDED}: {_NOTHING_DONE}") from error
         except KeyboardInterrupt:
@@ -169,18 +167,14 @@ class SadgsTrainer(Trainer):
         self.config.max_num_iterations = max(total - self._start_step, 0)
         if self._start_step >= total:
             writer.GLOBAL_BUFFER["step"] = self.step  # Only an iteration would set it.
-            note(
-                f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
-                f"{self._start_step} trains on."
-            )
+            told = f"This run is finished after {self._start_step} iterations"
+            note(f"{told}: --max-num-iterations of more than {self._start_step} trains on.")
         self._set_clock(0.0)
         events.report("loop begins")
         try:
             self._train_until_interrupted(total)
         except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
             raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
-        except RunError:
-            raise
         except torch.cuda.OutOfMemoryError as error:
             full = f"The GPU's memory was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
             raise RunError(f"{full} ({_memory(error)}): {_LESS_MEMORY}; {self._resume}.") from error
@@ -192,7 +186,7 @@ class SadgsTrainer(Trainer):
                 self.save_checkpoint(self._completed_step)
             raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
-            if self._peers is None or not self._peers.ended():
+            if isinstance(error, RunError) or self._peers is None or not self._peers.ended():
                 raise
             raise RunError(f"{_ANOTHER_ENDED}: {self._resume}.") from error
         finally:
@@ -313,10 +307,8 @@ class SadgsTrainer(Trainer):
             if self._completed_step > self._saved_step:
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
-        raise RunError(
-            f"{self.pipeline.diverged}; look at them with sadgs-doctor, and lower the learning rates if you raised "
-            f"them; {kept}."
-        )
+        remedy = "look at them with sadgs-doctor, and lower the learning rates if you raised them"
+        raise RunError(f"{self.pipeline.diverged}; {remedy}; {kept}.")
 
     def save_checkpoint(self, step: int) -> None:
         """Save as `checkpoints.write` does. Rank 0 gathers and writes the Gaussians of all processes."""

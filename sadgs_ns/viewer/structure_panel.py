@@ -40,13 +40,12 @@ from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 OUTPUT = "structure"
 """Name of the panel's picture among the viewer's output types."""
 OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
-PERIOD_HERE, ELLIPSES_HERE = "wavelength of this rendering", "ellipses of this rendering"
 PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
 OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
 """Choices that need the training photos."""
 OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
 """Choices that need observations of the training views."""
-CHOICES = [OFF, *OF_STATISTICS, PERIOD_HERE, ELLIPSES_HERE, *OF_PHOTOS]
+CHOICES = [OFF, *OF_STATISTICS, *OF_PHOTOS]
 RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
 """Smallest and largest values of the strategy's fields that may change while a run trains."""
 ROWS = 8
@@ -174,10 +173,8 @@ class StructurePanel(torch.nn.Module):
         finally:
             self._disable_button(False)
         seen = int((self._observed["n_total"] > 0).sum())
-        self._say(
-            f"Observed {number:,} training views, which see {seen:,} Gaussians: “{ETA_OF}”, “{CHILDREN_OF}” and "
-            f"“{LOW_OF}” show what was found."
-        )
+        told = f"Observed {number:,} training views, which see {seen:,} Gaussians"
+        self._say(f"{told}: “{ETA_OF}”, “{CHILDREN_OF}” and “{LOW_OF}” show what was found.")
 
     def _with_progress(self, views: range) -> Iterator[int]:
         """Yield the views, and show at most twice a second which one it is."""
@@ -235,18 +232,14 @@ class StructurePanel(torch.nn.Module):
         constant = cache.frequency_constant
         if choice in OF_STATISTICS:
             return self._of_gaussians(choice, camera, width, height)
-        if choice in (PERIOD_HERE, ELLIPSES_HERE):
-            photo, tensor, name = to_picture(rgb), cache.of_images(rgb[None])[0], "this rendering"
-        else:
-            cameras = datamanager.train_dataset.cameras.camera_to_worlds
-            extent = float(self._model.strategy_state["scene_scale"])
-            index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
-            photo = to_picture(cache.photo(datamanager.cached_train[index]))
-            tensor = dequantize(cache[index])
-            name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
+        cameras = datamanager.train_dataset.cameras.camera_to_worlds
+        extent = float(self._model.strategy_state["scene_scale"])
+        index = nearest_view(cameras, camera.camera_to_worlds[0].to(cameras), extent)
+        photo, tensor = to_picture(cache.photo(datamanager.cached_train[index])), dequantize(cache[index])
+        name = f"the nearest training view, `{datamanager.train_dataset.image_filenames[index].name}`"
         scale = min(height / photo.shape[0], width / photo.shape[1])
         size = max(round(scale * photo.shape[0]), 1), max(round(scale * photo.shape[1]), 1)
-        if choice in (ELLIPSES_HERE, ELLIPSES_NEAR):
+        if choice == ELLIPSES_NEAR:
             drawn = maps.draw_ellipses(photo, tensor, constant, size)
             title = "S̄⁻¹ as ellipses, coloured by period,"
         else:

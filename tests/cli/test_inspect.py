@@ -379,7 +379,7 @@ def test_the_viewer_is_told_of_a_camera_that_is_no_pinhole_and_goes_on(choice: s
 
 def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel):
     assert panel.statistics() is None, "the final checkpoint has none"
-    panel.choice.value = "wavelength of this rendering"
+    panel.choice.value = "wavelength of the nearest photo"
     panel.choose()
     assert panel.statistics() is None
     panel.choice.value = "η"

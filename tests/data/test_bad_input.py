@@ -1408,7 +1408,7 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
         ("use_grad_scaler", True, "use_grad_scaler must be False, since sadgs trains in float32, got True."),
         ("mixed_precision", True, "mixed_precision must be False, since sadgs trains in float32, got True."),
         ("load_dir", Path("nowhere"), "nowhere holds no checkpoint: give --load-dir the folder"),
-        ("load_checkpoint", Path("no.ckpt"), "no.ckpt does not exist: give --load-checkpoint a file"),
+        ("load_checkpoint", Path("no.ckpt"), "no.ckpt is no file: give --load-checkpoint one"),
         ("pipeline.views_per_iteration", 0, "pipeline.views_per_iteration must be at least 1, got 0."),
         ("pipeline.frequency_constant", -1.0, "pipeline.frequency_constant must be in (0, 4], got -1."),
         ("pipeline.model.ssim_lambda", 7.0, "pipeline.model.ssim_lambda must be in [0, 1], got 7."),

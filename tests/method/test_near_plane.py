@@ -15,7 +15,7 @@ EXTENT = 7.0
 
 
 def scene_near_plane(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor, extent: float = EXTENT) -> float:
-    return near_plane.scene_near_plane(near_plane.nearest_depths(points, viewmats, Ks, sizes), extent)
+    return near_plane.scene_near_plane(points, viewmats, Ks, sizes, extent)
 
 
 def row_of_cameras(number: int = 6) -> tuple[Tensor, Tensor, Tensor]:

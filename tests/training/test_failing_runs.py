@@ -491,7 +491,7 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
         checkpoints.checkpoint_paths(saved.parent, 3, None)
-    with pytest.raises(InputError, match=r"\S+/none\.ckpt does not exist: give --load-checkpoint a file"):
+    with pytest.raises(InputError, match=r"\S+/none\.ckpt is no file: give --load-checkpoint one"):
         checkpoints.checkpoint_paths(None, None, tmp_path / "none.ckpt")
     for step in (None, 5):
         assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
@@ -506,9 +506,9 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
 def test_what_is_given_to_the_wrong_option_is_told_where_it_belongs(saved: Path, tmp_path: Path):
     run = saved.parents[1]
     for folder in (run, saved.parent):
-        with pytest.raises(InputError, match=rf"^{folder} is a folder: give it to --load-dir instead of"):
+        with pytest.raises(InputError, match=rf"^{folder} is no file: give --load-checkpoint one, or --load-dir"):
             checkpoints.checkpoint_paths(None, None, folder)
-    with pytest.raises(InputError, match=rf"^{saved} is a file: give it to --load-checkpoint instead of --load-dir\.$"):
+    with pytest.raises(InputError, match=rf"^{saved} holds no checkpoint: give --load-dir the folder of a run"):
         checkpoints.checkpoint_paths(saved, None, None)
     with pytest.raises(InputError, match=r"^load_dir and load_checkpoint both name where the run goes on: give one"):
         checkpoints.checkpoint_paths(run, None, saved)

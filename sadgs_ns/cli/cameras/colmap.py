@@ -58,10 +58,8 @@ def make_model(colmap: Worker, *arguments: Any, folder: Path, report: Report) ->
 def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
     told = [_LOG_PREFIX.sub("", line).strip() for line in error.output.splitlines() if _ERROR_LINE.search(line)]
     if _FULL_DISK.search(error.output) or shutil.disk_usage(folder).free < _FULL_BELOW:
-        return OSError(
-            f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there): "
-            "make room, and run the same command again to resume."
-        )
+        problem = f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there)"
+        return OSError(f"{problem}: make room, and run the same command again to resume.")
     if error.exitcode == -signal.SIGKILL:
         return RunError(
             f"COLMAP was killed while it worked on {stage}, most likely for want of memory: close other programs, or "

@@ -165,9 +165,7 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
     values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}
     check_positive(values, where, list(values))
     if not np.isfinite(params).all() or len(params) != number:
-        raise InputError(
-            f"{where} has the parameters {params} instead of {number} finite numbers: run COLMAP's mapper again."
-        )
+        raise InputError(f"{where} has {params} instead of {number} finite parameters: run COLMAP's mapper again.")
     fx, fy, (cx, cy, *rest) = params[0], params[focals - 1], params[focals:]
     radial, tangential = (rest[:2], rest[2:]) if model == "OPENCV" else (rest, ())
     return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), "FISHEYE" in model)

@@ -118,10 +118,8 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     distances, spread = _spread(centres)
     offset = float(np.linalg.norm(np.median(centres, axis=0)))
     if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
-        yield fault(
-            f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart, which float32 "
-            "cannot tell apart: subtract their centre from all poses and points."
-        )
+        told = f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart"
+        yield fault(f"{told}, which float32 cannot tell apart: subtract their centre from all poses and points.")
     far = far_outliers(centres, CAMERA_SHARE)
     if far.any():
         where = and_more(views[int(far.argmax())].where, int(far.sum()))
@@ -208,20 +206,17 @@ def _check_distances(positions: NDArray[np.floating], views: Sequence[View], pat
     positions = positions.astype(np.float64)
     far = far_outliers(positions, POINT_SHARE)
     if far.any():
-        yield note(
-            f"{path} has {far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of "
-            "them: training leaves them out."
-        )
+        told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
+        yield note(f"{path} has {told}: training leaves them out.")
     positions = positions[~far]
     centres = np.stack([view.centre for view in views])  # [V, 3]
     middle, (_, spread) = np.median(centres, axis=0), _spread(centres)
     distance = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     remedy = "take points and poses of one reconstruction, in the same units and axes"
     if spread > 0 and distance > 1e3 * spread:
-        yield (fault if distance > 1e5 * spread else warning)(
-            f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart, so that all "
-            f"images see them from one direction: {remedy}."
-        )
+        told = f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart"
+        kind = fault if distance > 1e5 * spread else warning
+        yield kind(f"{told}, so that all images see them from one direction: {remedy}.")
         return
     seeing = _share_of_views_with_points(positions, views)
     if seeing < 0.5:

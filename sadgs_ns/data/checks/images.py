@@ -117,21 +117,16 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     if problems:
         return
     if all(_is_flat(frame.image) for frame in frames):
-        yield fault(
-            f"{source} has {len(frames)} images that show a single colour and nothing else, such as {frames[0].image}: "
-            "export them again."
-        )
+        told = f"{source} has {len(frames)} images that show a single colour and nothing else"
+        yield fault(f"{told}, such as {frames[0].image}: export them again.")
     if all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
-        yield fault(
-            f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}, which leaves no pixel to "
-            "train on: make white what is to be trained on."
-        )
+        told = f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}"
+        yield fault(f"{told}, which leaves no pixel to train on: make white what is to be trained on.")
     lying = [frame.image for frame, image in zip(frames, images, strict=True) if _may_lie(image)]
     if lying:
-        yield warning(
-            f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it, which training ignores, as "
-            f"COLMAP does: if the poses are those of the turned images, {_TURN}."
-        )
+        told = f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it"
+        remedy = f"if the poses are those of the turned images, {_TURN}"
+        yield warning(f"{told}, which training ignores, as COLMAP does: {remedy}.")
     yield note(_describe(source, images, masks))
 
 
