@@ -22,10 +22,8 @@ rest of the package, its Triton kernels too, reads both layouts; if a new gsplat
 to one of these."""
 NEAR_PLANE = 0.01
 """Depth in world units from which gsplat 1.4 and 1.5, and most viewers of exported files, draw Gaussians."""
-FAR_PLANE = 1e10
-"""Depth in world units up to which gsplat draws Gaussians."""
-SCREEN_BLUR = 0.3
-"""What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²."""
+FAR_PLANE = 1e10  # Depth in world units up to which gsplat draws Gaussians
+SCREEN_BLUR = 0.3  # What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²
 
 
 def has_radius_per_axis(radii: Tensor, means2d: Tensor) -> bool:

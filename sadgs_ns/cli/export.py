@@ -28,8 +28,7 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
     from sadgs_ns.method.cleaning import Cleaning
     from sadgs_ns.render.types import RenderOptions
 
-Box = tuple[float, float, float, float, float, float]
-"""Lowest x, y and z, and highest."""
+Box = tuple[float, float, float, float, float, float]  # Lowest x, y and z, and highest
 _OUTPUT = f"The file to write: {', '.join(FORMATS)}, or {MESH} for a mesh."
 _MAX_OFF_AXIS = 4.0  # Limit for runs of splatfacto, which has none; what it leaves out has no true size on the screen
 _PREFIX = "_model.gauss_params."

@@ -30,8 +30,7 @@ from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 
 Split = Literal["train", "eval"]
-SEED = 0
-"""Seed of the random colours and of AbsGS's children."""
+SEED = 0  # Seed of the random colours and of AbsGS's children
 MIN_SIDE, MIN_RENDER_SIDE = 900, 640
 """Least length in px of the longer side of a picture with ellipses, and of a rendering in random colours; Gaussians in
 a smaller one could not be told apart."""

@@ -22,8 +22,7 @@ from sadgs_ns.formats.mesh import DepthView, Fusion
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
-MIN_ALPHA = 0.5
-"""Pixels with less accumulated opacity show no surface."""
+MIN_ALPHA = 0.5  # Pixels with less accumulated opacity show no surface
 _SAMPLED = 16  # Most views from which the size of voxels is derived
 
 

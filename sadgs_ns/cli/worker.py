@@ -27,8 +27,7 @@ from sadgs_ns import events
 from sadgs_ns.errors import InputError, RunError, sentence_of
 from sadgs_ns.training.interrupts import Interrupted
 
-OnEvent = Callable[..., None]
-"""Called with an event's name and, by keyword, its fields."""
+OnEvent = Callable[..., None]  # Called with an event's name and, by keyword, its fields
 _POLL_SECONDS = 0.1
 _KEPT_BYTES = 65536  # Size of the end of a failed process's output that is searched for the reason
 _PROMPT = "$ "  # Stands before a command in a log

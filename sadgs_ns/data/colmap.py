@@ -26,8 +26,7 @@ CAMERA_PARAMETERS = {
 }  # fmt: skip
 """Number of parameters of each of COLMAP's camera models, in the order of the models' numbers."""
 
-Points = tuple[NDArray[np.float64], NDArray[np.uint8]]
-"""Positions [P, 3] and colours in 0 … 255 [P, 3]."""
+Points = tuple[NDArray[np.float64], NDArray[np.uint8]]  # Positions [P, 3] and colours in 0 … 255 [P, 3]
 Pose = tuple[str, int, NDArray[np.float64]]
 """An image's name, its camera's id and its pose: wxyz quaternion and translation, world to camera [7]."""
 

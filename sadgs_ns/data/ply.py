@@ -15,8 +15,7 @@ from sadgs_ns.errors import InputError, reason
 _PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
 COLORS = [[prefix + name for name in names] for prefix in _PREFIXES for names in (("red", "green", "blue"), "rgb")]
 """Names that programs give to colours, in small letters."""
-GREY = 127
-"""Colour of points without one, in 0 … 255."""
+GREY = 127  # Colour of points without one, in 0 … 255
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

@@ -23,8 +23,7 @@ FORMATS: dict[str, Callable[[IO[bytes], Gaussians, Context], None]] = {
     ".html": html.write,
 }
 """The writer of each format of Gaussians, by the end of the file's name. Help, options and tests iterate over them."""
-MESH = ".mesh.ply"
-"""End of the name of a triangle mesh."""
+MESH = ".mesh.ply"  # End of the name of a triangle mesh
 
 
 def format_of(path: Path) -> str:

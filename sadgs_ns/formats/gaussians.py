@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from sadgs_ns.data.coordinates import Similarity
 
-DEGREE_0 = 0.5 / np.sqrt(np.pi)
-"""The spherical harmonic of degree 0."""
+DEGREE_0 = 0.5 / np.sqrt(np.pi)  # The spherical harmonic of degree 0
 _ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that float64 takes little memory
 
 Array = NDArray[np.float32]

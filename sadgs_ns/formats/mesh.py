@@ -21,8 +21,7 @@ TriangleMesh = Any
 `vertex_colors` in [0, 1] [V, 3], and `triangles`, with corners counterclockwise for a camera that sees them [F, 3]."""
 MOST_VOXELS = 60_000_000
 """Most voxels of a mesh; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
-PIXELS_PER_VOXEL = 2.0
-"""Edge of a voxel if none is given, in pixels of the median depth."""
+PIXELS_PER_VOXEL = 2.0  # Edge of a voxel if none is given, in pixels of the median depth
 _TRUNCATION = 4.0  # Voxels behind a surface that count as near it; thinner walls have no two sides
 _WIDEST_PIXEL = 4.0
 """Width in voxels, at their depth, above which pixels are left out, as they are far behind what the views show."""

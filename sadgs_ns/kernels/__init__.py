@@ -15,14 +15,12 @@ from torch import Tensor
 
 from sadgs_ns.errors import reason
 
-OLDEST_TRITON = (3, 5)
-"""Older versions do not compile all kernels: Triton 3.4 has no matrix products with 8 columns."""
+OLDEST_TRITON = (3, 5)  # Older versions do not compile all kernels: Triton 3.4 has no matrix products with 8 columns
 
 TILE_SIZE = 8
 """Side of our rasterizer's tiles in px. gsplat's default of 16 saves list entries; with exact lists, saved pixels
 matter more. A tile has one warp, and each of its lanes two pixels."""
-SWITCH = "SADGS_TRITON"
-"""Environment variable; 0 keeps a process from using the kernels."""
+SWITCH = "SADGS_TRITON"  # Environment variable; 0 keeps a process from using the kernels
 
 _forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
 """The answer of `use_triton`; None if the device decides."""

@@ -27,8 +27,7 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns.kernels import TILE_SIZE
 from sadgs_ns.kernels.shared import load3, store3
 
-SCALE = tl.constexpr(0.8493218002880191)
-"""√(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial."""
+SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial
 _FAINTEST = tl.constexpr(0x3B808081)  # Bits of 1/255
 _GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16
 """Gaussians of a batch. Forward, 16 take 1.2 times as long, and 32 take 1.5 times."""

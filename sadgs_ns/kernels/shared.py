@@ -7,8 +7,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-TINY = tl.constexpr(1.1754943508222875e-38)
-"""The smallest normal float32, whose logarithm is finite."""
+TINY = tl.constexpr(1.1754943508222875e-38)  # The smallest normal float32, whose logarithm is finite
 
 
 @triton.jit

@@ -23,10 +23,8 @@ SUPPORT = 2.0
 """A Gaussian stands for a surface if a point to start from lies within this many of its standard deviations."""
 MOST_VIEWS = 60
 """Training views up to which a run prunes it, where nobody says. Of more views, files lost nothing without."""
-NEIGHBOURS = 4
-"""A path leads from each camera to so many of the others, the nearest that look in a similar direction."""
-SIMILAR_DEGREES = 60.0
-"""Largest angle between the viewing axes of two cameras with a path between them."""
+NEIGHBOURS = 4  # A path leads from each camera to so many of the others, the nearest that look in a similar direction
+SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
 _CELLS = 32  # Cells on each side of a grid that tells which Gaussians may be near a path
 _PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
 

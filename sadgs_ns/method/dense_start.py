@@ -15,18 +15,12 @@ from torch import Tensor
 
 from sadgs_ns.method.stereo import DepthMap
 
-NUMBER = 150_000
-"""Points that are drawn at most."""
-MIN_CONFIDENCE = 0.5
-"""Confidence of a depth from which its pixel is drawn."""
-AGREEING_CONFIDENCE = 0.1
-"""Confidence of a depth from which its view has a say about points."""
-AGREEING_VIEWS = 2
-"""Views, its own among them, that must agree with a point's depth."""
-DEPTH_TOLERANCE = 0.02
-"""Largest relative difference of depths that agree."""
-SCALE = 0.5
-"""Largest standard deviation of a point, in wavelengths: its η is 1/2."""
+NUMBER = 150_000  # Points that are drawn at most
+MIN_CONFIDENCE = 0.5  # Confidence of a depth from which its pixel is drawn
+AGREEING_CONFIDENCE = 0.1  # Confidence of a depth from which its view has a say about points
+AGREEING_VIEWS = 2  # Views, its own among them, that must agree with a point's depth
+DEPTH_TOLERANCE = 0.02  # Largest relative difference of depths that agree
+SCALE = 0.5  # Largest standard deviation of a point, in wavelengths: its η is 1/2
 _DRAWN = 4  # Points that are drawn for each one that is wanted, because many do not stay
 
 

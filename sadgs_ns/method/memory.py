@@ -23,8 +23,7 @@ from sadgs_ns.method.ops import Params
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
 takes the place of the statistics and of a split's copy, which are gone by then."""
-ACTIVATION_BYTES = 16
-"""Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4."""
+ACTIVATION_BYTES = 16  # Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4
 ACTIVATION_GRADIENT_BYTES = 28
 """Bytes of a Gaussian in the backward pass: gradients of the activations 16, the means' from harmonics 12."""
 PROJECTION_BYTES = 52
@@ -41,8 +40,7 @@ numbers that are gathered, sent, received and taken apart 48 each. Every Gaussia
 PAIR_SORT_BYTES = 40
 """Bytes of a pair of a Gaussian and a tile while pairs are sorted by tile, with tiles of 32 bits: tiles 4, Gaussians 4,
 sorted tiles 4, indices before 8 and after 8 the sort, the sort's buffers 12. With tiles of 16 bits they are 34."""
-PAIR_BYTES = 4
-"""Bytes of such a pair until the end of the step: the Gaussian in the tile's list."""
+PAIR_BYTES = 4  # Bytes of such a pair until the end of the step: the Gaussian in the tile's list
 PIXEL_BYTES = 54
 """Bytes of a pixel in the backward pass of rasterization: the rendered colours 12 and those on the background 12,
 alphas 4, last Gaussians 4, gradient of the colours 12 and of alphas 4, image in bytes 3, quantized S̄ 3."""
@@ -51,8 +49,7 @@ LOSS_PIXEL_BYTES = 162
 Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, quantized S̄ 3."""
 TORCH_LOSS_PIXEL_BYTES = 300
 """The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
-PAIRS_PER_GAUSSIAN = 12
-"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox."""
+PAIRS_PER_GAUSSIAN = 12  # Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox
 
 
 @dataclass(frozen=True)

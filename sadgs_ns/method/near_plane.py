@@ -13,13 +13,11 @@ from torch import Tensor
 
 from sadgs_ns.method.initialization import plausible_points
 
-NEAREST_POINTS = 5
-"""The depth of a view's fifth SfM point is taken for true; the four that are nearer may be errors."""
+NEAREST_POINTS = 5  # The depth of a view's fifth SfM point is taken for true; the four that are nearer may be errors
 NEAR_SHARE = 0.5
 """The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in two of nine sets of
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""
-UNKNOWN_SHARE = 0.01
-"""The near plane where no view sees enough SfM points, as a share of the cameras' extent."""
+UNKNOWN_SHARE = 0.01  # The near plane where no view sees enough SfM points, as a share of the cameras' extent
 _MOST_POINTS = 2**17  # Of more points, so many are looked at, since a point in each of thousands of views takes time
 _PAIRS = 2**24  # Pairs of a pose and a point that are computed at a time, in arrays of 64 MB
 

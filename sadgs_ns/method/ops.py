@@ -14,8 +14,7 @@ Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """The optimizers of parameters by their names; a parameter that is not trained may have none."""
-State = MutableMapping[str, Any]
-"""The state of a strategy; its tensors have leading dimension N."""
+State = MutableMapping[str, Any]  # The state of a strategy; its tensors have leading dimension N
 
 
 def opacities(params: Params) -> Tensor:

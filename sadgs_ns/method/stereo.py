@@ -22,24 +22,16 @@ from sadgs_ns.method.near_plane import depths_in_views
 
 WORKING_SIDE = 800
 """Longest side in px at which depth is computed. Larger images are reduced, since time grows with the area."""
-LEVELS = 3
-"""Levels of the image pyramid. Each has half the sides of the one before."""
-WINDOW = 5
-"""Side in px, odd, of the windows that are compared."""
+LEVELS = 3  # Levels of the image pyramid. Each has half the sides of the one before
+WINDOW = 5  # Side in px, odd, of the windows that are compared
 SMOOTHING = 5
 """Side in px, odd, of the box over which scores are averaged, so that pixels without texture follow those beside."""
-HYPOTHESES = 128
-"""Most intervals of inverse depth on the coarsest level. Time and memory grow with them."""
-NEIGHBOURS = 4
-"""Neighbours per view. Time grows with them; with fewer, occlusions leave holes."""
-NOISE = 0.004
-"""Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0."""
-SCORES = (0.5, 0.8)
-"""Correlation at which confidence begins, and from which on it is full. Lower ones add few pixels."""
-AGREEING = 3
-"""Neighbours that agree with a depth of full confidence, or all if there are fewer."""
-DEPTH_TOLERANCE = 0.01
-"""Largest relative difference between two views' depths that agree."""
+HYPOTHESES = 128  # Most intervals of inverse depth on the coarsest level. Time and memory grow with them
+NEIGHBOURS = 4  # Neighbours per view. Time grows with them; with fewer, occlusions leave holes
+NOISE = 0.004  # Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0
+SCORES = (0.5, 0.8)  # Correlation at which confidence begins, and from which on it is full. Lower ones add few pixels
+AGREEING = 3  # Neighbours that agree with a depth of full confidence, or all if there are fewer
+DEPTH_TOLERANCE = 0.01  # Largest relative difference between two views' depths that agree
 PIXEL_TOLERANCE = 1.0
 """Depths agree if a pixel's own takes it to a neighbour, and the neighbour's takes it back to within this many px."""
 

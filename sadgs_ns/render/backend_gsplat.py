@@ -12,8 +12,7 @@ from sadgs_ns import gsplat_compat
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
-TILE_SIZE = 16
-"""Size of tiles in px: gsplat's own choice, with which its kernels are fastest."""
+TILE_SIZE = 16  # Size of tiles in px: gsplat's own choice, with which its kernels are fastest
 
 
 def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begin_tiles: bool = True) -> Projected:

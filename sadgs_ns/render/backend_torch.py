@@ -19,8 +19,7 @@ from sadgs_ns.render.ewa import covariances, perspective, spherical_harmonics, w
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
-TILE_SIZE = 16
-"""Size of tiles in px."""
+TILE_SIZE = 16  # Size of tiles in px
 
 # These are the constants of gsplat's compositing.
 _MAX_ALPHA, _MIN_ALPHA, _MIN_TRANSMITTANCE = 0.999, 1.0 / 255.0, 1e-4

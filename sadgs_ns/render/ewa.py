@@ -10,8 +10,7 @@ import torch.nn.functional as F
 from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
-FRUSTUM_MARGIN = 0.3
-"""The projection's Jacobian is taken at most this many half images beyond the image's border."""
+FRUSTUM_MARGIN = 0.3  # The projection's Jacobian is taken at most this many half images beyond the image's border
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:

@@ -17,14 +17,10 @@ from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.training.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
 
-PLANNED_SHARE = 0.8
-"""Share of the available memory to plan with; the rest is for fragments and other programs."""
-QUANTIZED_BYTES = 3
-"""Bytes that S̄ takes for each pixel of the training images (`method.quantization`)."""
-STRUCTURE_PIXEL_BYTES = 300
-"""Bytes that a pixel takes at most while S̄ is computed."""
-MANY_IMAGES = 500
-"""nerfstudio would keep up to so many training images on the device, whatever their size."""
+PLANNED_SHARE = 0.8  # Share of the available memory to plan with; the rest is for fragments and other programs
+QUANTIZED_BYTES = 3  # Bytes that S̄ takes for each pixel of the training images (`method.quantization`)
+STRUCTURE_PIXEL_BYTES = 300  # Bytes that a pixel takes at most while S̄ is computed
+MANY_IMAGES = 500  # nerfstudio would keep up to so many training images on the device, whatever their size
 IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
 """Largest shares of the device's free memory for the images if there are more than `MANY_IMAGES`, and if not."""
 HOST_SHARE = 0.5

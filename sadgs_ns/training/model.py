@@ -41,8 +41,7 @@ from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
 brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
-NORMALS = "normals"
-"""Name of an output that is computed only if it is read."""
+NORMALS = "normals"  # Name of an output that is computed only if it is read
 LIMIT_EVERY = 25
 """Iterations from one limit on scales to the next, in which an axis grows at most threefold at the presets' rates."""
 

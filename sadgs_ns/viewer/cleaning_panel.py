@@ -20,8 +20,7 @@ from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
-OUTPUT = "cleaned"
-"""Name of the panel's picture among the viewer's output types."""
+OUTPUT = "cleaned"  # Name of the panel's picture among the viewer's output types
 OFF, STAYS, GOES = "off", "what stays", "what goes"
 NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
 """Corners of the box at first, in world units, which crop nothing."""

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap, Normalize
     from matplotlib.figure import Figure
 
-Picture = NDArray[np.uint8]
-"""RGB. [H, W, 3]"""
+Picture = NDArray[np.uint8]  # RGB. [H, W, 3]
 
-NOTHING = "black"
-"""Colour of pixels without a value, which no scale has, unlike grey, which cividis has in its middle."""
+NOTHING = "black"  # Colour of pixels without a value, which no scale has, unlike grey, which cividis has in its middle
 
 
 @dataclass(frozen=True)

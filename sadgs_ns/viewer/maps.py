@@ -24,10 +24,8 @@ from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 from sadgs_ns.viewer.color_scales import PERIOD, Picture
 
-ELLIPSES_ACROSS = 28
-"""Number of ellipses along an image's shorter side."""
-MIN_COVER = 0.05
-"""Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty."""
+ELLIPSES_ACROSS = 28  # Number of ellipses along an image's shorter side
+MIN_COVER = 0.05  # Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty
 
 
 @torch.no_grad()

@@ -37,19 +37,15 @@ from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
-OUTPUT = "structure"
-"""Name of the panel's picture among the viewer's output types."""
+OUTPUT = "structure"  # Name of the panel's picture among the viewer's output types
 OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
 PERIOD_NEAR, ELLIPSES_NEAR = "wavelength of the nearest photo", "ellipses of the nearest photo"
-OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)
-"""Choices that need the training photos."""
-OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)
-"""Choices that need observations of the training views."""
+OF_PHOTOS = (PERIOD_NEAR, ELLIPSES_NEAR)  # Choices that need the training photos
+OF_STATISTICS = (ETA_OF, CHILDREN_OF, LOW_OF)  # Choices that need observations of the training views
 CHOICES = [OFF, *OF_STATISTICS, *OF_PHOTOS]
 RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
 """Smallest and largest values of the strategy's fields that may change while a run trains."""
-ROWS = 8
-"""Number of the last structure steps in the table."""
+ROWS = 8  # Number of the last structure steps in the table
 
 
 def changed(plan: RunPlan, name: str, value: float) -> RunPlan:

@@ -19,8 +19,7 @@ from typing import Any
 from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import RunError, free_space
 
-Report = Callable[[str, int, int], None]
-"""Called with a stage's name, the work that is done, and all its work."""
+Report = Callable[[str, int, int], None]  # Called with a stage's name, the work that is done, and all its work
 _FULL_DISK = re.compile("no space left|disk is full|disk I/O error|file too large|failed to write", re.IGNORECASE)
 _FULL_BELOW = 8 * 2**20  # Free bytes under which a disk counts as full
 _LOG_PREFIX = re.compile(r"^([IWEF]\d{8} .*?\] |\s*what\(\):\s*)?(\[[\w.]+:\d+\] )?(Check failed: (\S+\(\) )?)?")

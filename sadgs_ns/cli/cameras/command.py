@@ -47,8 +47,7 @@ from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.training.interrupts import Interrupts
 
-MIN_SIZE = 64
-"""Least longest side of the result in px; no structure is left in smaller images."""
+MIN_SIZE = 64  # Least longest side of the result in px; no structure is left in smaller images
 _SECONDS_PER_LINE = 1.0  # Least time between two lines of a stage's progress in a file
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
 """Keys that a scene's `transforms.json` keeps when photos are added."""

@@ -21,8 +21,7 @@ from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 
-MOST_FEATURES = 8192
-"""Most features of a photo, those with the most contrast; COLMAP's own limit."""
+MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first

@@ -19,8 +19,7 @@ from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.errors import InputError
 
-COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}
-"""Pillow's names of the formats that COLMAP and OpenCV read."""
+COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"

@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-EXHAUSTIVE_LIMIT = 40
-"""Most photos for which every pair is matched; twice the photos take four times as long."""
-NEIGHBORS = 20
-"""Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)."""
-MAX_SIDE = 3200
-"""Longest side in px to which photos are scaled down to find features, as COLMAP does."""
+EXHAUSTIVE_LIMIT = 40  # Most photos for which every pair is matched; twice the photos take four times as long
+NEIGHBORS = 20  # Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)
+MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
 _PAIRS_PER_PHOTO = {"sequential": 16, "similar": NEIGHBORS}  # Other photos that each photo is matched with, at most
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 

@@ -51,8 +51,7 @@ _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose
 _ENOUGH, _MOST_STRETCH = 0.9, 0.05
 """Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
 of lenses differ less, those of models that went wrong in the beginning more."""
-FEW_FEATURES = 500
-"""Keypoints under which a photo counts as blurred or empty."""
+FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
 
 
 def make_model(

@@ -21,8 +21,7 @@ from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import read_text
 from sadgs_ns.errors import InputError
 
-UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}
-"""COLMAP's camera models that nerfstudio cannot read."""
+UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's camera models that nerfstudio cannot read
 
 
 @collect_findings
