@@ -1,10 +1,12 @@
-"""How fast the commands answer, held without a clock: by what they import."""
+"""How fast the commands answer, held without a clock, by what they import; and their versions."""
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -49,3 +51,10 @@ def test_the_doctor_imports_torch_and_little_else(tmp_path: Path):
     write_scene(tmp_path / "scene", 32, 24, 9, 20)
     modules = imported(SCRIPTS["sadgs-doctor"], [str(tmp_path / "scene")])
     assert "torch" in modules and not modules & {*SLOW, "torch._dynamo", "torch._inductor"} - {"torch"}
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_each_command_prints_its_version(name: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit, match=r"^0$"):
+        importlib.import_module(SCRIPTS[name]).main(["--version"])
+    assert capsys.readouterr().out == f"{name} {version('sadgs_ns')}\n"
