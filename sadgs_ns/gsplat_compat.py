@@ -62,11 +62,12 @@ def project(
 def try_kernels() -> None:
     """Run one of gsplat's CUDA kernels, for which gsplat loads or compiles them all.
 
-    Raise RuntimeError if they neither came with the wheel nor can be compiled for lack of a toolkit, and whatever
-    compiling them raises.
+    Raise RuntimeError if they neither came with the wheel nor can be compiled for lack of a toolkit, or were compiled
+    for another GPU, and whatever compiling them raises.
     """
     direction = torch.ones((1, 3), device="cuda")
     try:
-        gsplat.spherical_harmonics(0, direction, direction[None])
+        # gsplat 1.4 does not ask whether its kernel was launched; torch does at the sum.
+        gsplat.spherical_harmonics(0, direction, direction[None]).sum().item()
     except AttributeError as error:  # gsplat looks the kernel up in None.
         raise RuntimeError("neither prebuilt nor compiled") from error

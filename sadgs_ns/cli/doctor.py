@@ -7,6 +7,7 @@ import ctypes.util
 import importlib.util
 import os
 import platform
+import re
 import shlex
 import shutil
 import warnings
@@ -25,6 +26,14 @@ from sadgs_ns.errors import free_space, reason
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
 _LPIPS_FILE = "alexnet-owt-7be5be79.pth"  # The file in which torchvision keeps the weights of LPIPS's AlexNet
+_DRIVER_FILE = Path("/proc/driver/nvidia/version")  # NVIDIA's driver writes it, but not under WSL
+_NEEDED = (  # A program or library, its names, what needs it, and the remedy
+    ("nvcc", "nvcc", "gsplat compiles with it if its wheel has no CUDA kernels; install the toolkit of torch's CUDA"),
+    ("C compiler", "gcc clang", "Triton and gsplat compile with it; install the packages gcc, g++ and python3-dev"),
+    ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, `ns-process-data` too; install the package ffmpeg"),
+    ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
+    ("Node.js", "npx", "pages (.html) are written with its npx; install version 22 or newer from nodejs.org"),
+)
 
 
 def versions() -> dict[str, str]:
@@ -45,28 +54,29 @@ def check_machine() -> Iterator[Finding]:
     except Exception as error:  # A broken installation raises anything.
         yield fault(f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
-    if torch.cuda.is_available():
+    with warnings.catch_warnings(record=True) as caught:  # torch warns of a driver that is too old.
+        warnings.simplefilter("always")
+        has_gpu = torch.cuda.is_available()
+    if has_gpu:
         yield from _check_cuda()
     else:
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
+        why = "".join(f" ({str(warning.message).partition('. ')[0]})" for warning in caught)
         yield warning(
-            f"torch is {built} and sees no GPU: training runs on {os.cpu_count()} CPU cores, which is for small scenes "
-            "and tests; for more, install a GPU's driver and a torch for its CUDA."
+            f"torch is {built} and sees no GPU{why}: training runs on {os.cpu_count()} CPU cores, which is for small "
+            "scenes and tests; for more, install a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and a "
+            "torch for its CUDA."
         )
     if (weights := Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)).is_file():
         yield note(f"LPIPS with AlexNet has its weights: {weights}.")
     else:
         remedy = f"the first `ns-eval` downloads them to {weights}, or leaves it out"
         yield warning(f"LPIPS with AlexNet has no weights: {remedy}.")
-    for program, package, use in (
-        ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, and nerfstudio to scale images down"),
-        ("libusb-1.0", "libusb-1.0-0", "`ns-export`, `ns-process-data` and meshes import open3d, which needs it"),
-    ):
-        found = shutil.which(program) or ctypes.util.find_library(program.removeprefix("lib"))
-        if found:
+    for program, names, use in _NEEDED:
+        if found := next(filter(None, (shutil.which(n) or ctypes.util.find_library(n) for n in names.split())), None):
             yield note(f"{program}: {found}.")
-        else:
-            yield warning(f"{program} is missing: {use}; install the system's package {package}.")
+        else:  # The check of gsplat says whether nvcc is needed.
+            yield (note if program == "nvcc" else warning)(f"{program} is missing: {use}.")
 
 
 def _load_torchvision() -> None:
@@ -91,7 +101,16 @@ def _check_cuda() -> Iterator[Finding]:
 
     device = torch.device("cuda")
     name, (free, total) = torch.cuda.get_device_name(device), torch.cuda.mem_get_info(device)
-    yield note(f"GPU: {name}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA {torch.version.cuda}.")
+    capability, built = torch.cuda.get_device_capability(device), torch.cuda.get_arch_list()
+    driver = re.search(r"\d{3}\.[\d.]+", _DRIVER_FILE.read_text()) if _DRIVER_FILE.exists() else None
+    sm = "sm_{}{}".format(*capability)
+    yield note(f"GPU: {name}, {sm}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA {torch.version.cuda}.")
+    yield note(f"NVIDIA driver: {driver[0] if driver else 'unknown'}.")
+    if not _runs(built, capability):
+        newer = "torch 2.9 or newer for CUDA 12.8 or newer, which RTX 50 (sm_120) needs"
+        remedy = newer if capability >= (7, 5) else "a torch for CUDA 12.6, the last with code for cards before sm_75"
+        yield fault(f"This torch has code for {', '.join(built)}, but none for this GPU, {sm}: install {remedy}.")
+        return
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
@@ -109,10 +128,16 @@ def _check_cuda() -> Iterator[Finding]:
 
         gsplat_compat.try_kernels()
     except Exception as error:  # Its compilation fails in many ways.
-        remedy = "install its wheel for this torch, or the CUDA toolkit"
-        yield fault(f"gsplat has no CUDA kernels ({reason(error)}): {remedy}.")
+        remedy = f"install its wheel for this torch and GPU, or the toolkit of CUDA {torch.version.cuda}"
+        yield fault(f"gsplat has no CUDA kernels for this GPU ({reason(error)}): {remedy}.")
     else:
         yield note("gsplat has its CUDA kernels.")
+
+
+def _runs(built: Sequence[str], capability: tuple[int, int]) -> bool:
+    """Return whether code for architectures, such as sm_80 or compute_90, which is PTX, runs on a GPU's capability."""
+    known = [(kind, (int(major), int(minor))) for kind, major, minor in re.findall(r"(\w+)_(\d+)(\d)", " ".join(built))]
+    return not known or any(v <= capability and (kind == "compute" or v[0] == capability[0]) for kind, v in known)
 
 
 @dataclass

@@ -39,7 +39,7 @@ def about(word: str) -> tuple[str, str]:
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """Pretend that there is a GPU, on which everything works until the fields say otherwise."""
-    state = SimpleNamespace(compiles=True, has_gsplat=True)
+    state = SimpleNamespace(compiles=True, has_gsplat=True, capability=(8, 9), architectures=["sm_80", "sm_90"])
 
     def available(device: torch.device) -> bool:
         if not state.compiles:
@@ -53,6 +53,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (6_000_000_000, 8_000_000_000))
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "A GPU")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: state.capability)
+    monkeypatch.setattr(torch.cuda, "get_arch_list", lambda: state.architectures)
     monkeypatch.setattr(kernels, "available", available)
     monkeypatch.setattr(gsplat_compat, "try_kernels", try_kernels)
     return state
@@ -124,21 +126,73 @@ def test_a_machine_without_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     severity, sentence = about("sees no GPU")
     assert severity == "warning" and re.search(r"training runs on \d+ CPU cores", sentence)
-    assert not [s for s in machine() if "Triton" in s or "gsplat" in s]  # of no use there
+    assert not [s for s in machine() if "its kernels" in s or "CUDA kernels." in s]  # of no use there
 
 
-def test_a_gpu_s_memory_and_its_kernels_are_notes(cuda: SimpleNamespace):
-    assert about("A GPU") == ("note", f"GPU: A GPU, 6.0 of 8.0 GB free, CUDA {torch.version.cuda}.")
-    assert about("Triton") == ("note", "Triton compiles its kernels here.")
-    assert about("gsplat") == ("note", "gsplat has its CUDA kernels.")
+def test_a_driver_that_is_too_old_for_torch_is_named(monkeypatch: pytest.MonkeyPatch):
+    def available() -> bool:
+        said = "CUDA initialization: The NVIDIA driver on your system is too old (found version 12020)"
+        warnings.warn(f"{said}. Please update your GPU driver.", stacklevel=2)
+        return False
+
+    monkeypatch.setattr(torch.cuda, "is_available", available)
+    severity, sentence = about("sees no GPU")
+    assert severity == "warning" and "too old (found version 12020)): training runs on" in sentence
+    assert "a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and" in sentence
+
+
+def test_a_gpu_its_driver_and_its_kernels_are_notes(
+    cuda: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(doctor, "_DRIVER_FILE", tmp_path / "version")
+    assert about("A GPU") == ("note", f"GPU: A GPU, sm_89, 6.0 of 8.0 GB free, CUDA {torch.version.cuda}.")
+    assert about("Triton compiles its") == ("note", "Triton compiles its kernels here.")
+    assert about("gsplat has") == ("note", "gsplat has its CUDA kernels.")
+    assert about("driver") == ("note", "NVIDIA driver: unknown.")
+    (tmp_path / "version").write_text(
+        "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.95.05  Release Build\n"
+    )
+    assert about("driver") == ("note", "NVIDIA driver: 580.95.05.")
+
+
+@pytest.mark.parametrize(
+    ("capability", "architectures", "remedy"),
+    [
+        ((12, 0), ["sm_75", "sm_80", "sm_86", "sm_90", "sm_100", "sm_120"], None),
+        ((12, 1), ["sm_90", "sm_120"], None),  # code for 12.0 runs on 12.1
+        ((12, 0), ["sm_80", "sm_90", "compute_90"], None),  # PTX is compiled by the driver
+        ((8, 9), ["sm_75", "sm_86"], None),
+        ((9, 0), [], None),  # it does not say
+        (
+            (12, 0),
+            ["sm_50", "sm_80", "sm_90"],
+            "torch 2.9 or newer for CUDA 12.8 or newer, which RTX 50 (sm_120) needs.",
+        ),
+        ((8, 0), ["sm_86"], "torch 2.9 or newer for CUDA 12.8 or newer, which RTX 50 (sm_120) needs."),
+        (
+            (6, 1),
+            ["sm_75", "sm_120", "compute_120"],
+            "a torch for CUDA 12.6, the last with code for cards before sm_75.",
+        ),
+    ],
+)
+def test_a_gpu_that_torch_was_not_built_for_is_an_error(
+    capability: tuple[int, int], architectures: list[str], remedy: str | None, cuda: SimpleNamespace
+):
+    cuda.capability, cuda.architectures = capability, architectures
+    errors = [sentence for sentence, severity in machine().items() if severity == "error"]
+    sm = "sm_{}{}".format(*capability)
+    told = f"This torch has code for {', '.join(architectures)}, but none for this GPU, {sm}: install {remedy}"
+    assert errors == ([told] if remedy else [])
+    assert any("kernels here" in sentence for sentence in machine()) == (remedy is None)  # else not even tried
 
 
 def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
     cuda.compiles = cuda.has_gsplat = False
-    severity, sentence = about("Triton")
+    severity, sentence = about("Triton's")
     assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
     assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")
-    severity, sentence = about("gsplat")
+    severity, sentence = about("gsplat has")
     assert severity == "error" and "(neither prebuilt nor compiled): install its wheel" in sentence
 
 
@@ -152,15 +206,26 @@ def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, mon
     assert about("LPIPS with AlexNet") == ("note", f"LPIPS with AlexNet has its weights: {path}.")
 
 
-@pytest.mark.parametrize(("program", "package"), [("ffmpeg", "ffmpeg"), ("libusb-1.0", "libusb-1.0-0")])
-def test_what_nerfstudio_s_commands_need_is_looked_for(program: str, package: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}" if name == "ffmpeg" else None)
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so" if name == "usb-1.0" else None)
-    assert about(f"{program}: ")[0] == "note"
+@pytest.mark.parametrize(
+    ("program", "found", "severity", "need", "remedy"),
+    [
+        ("nvcc", "nvcc", "note", "gsplat compiles with it", "the toolkit of torch's CUDA"),
+        ("C compiler", "clang", "warning", "Triton and gsplat", "the packages gcc, g++ and python3-dev"),
+        ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it for videos", "the package ffmpeg"),
+        ("libusb-1.0", "usb-1.0", "warning", "`ns-export`, `ns-process-data` and meshes", "the package libusb-1.0-0"),
+        ("Node.js", "npx", "warning", "pages (.html)", "version 22 or newer from nodejs.org"),
+    ],
+)
+def test_programs_are_looked_for_and_their_use_is_told(
+    program: str, found: str, severity: str, need: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+):
+    for module, name in ((shutil, "which"), (ctypes.util, "find_library")):
+        monkeypatch.setattr(module, name, lambda name: f"/there/{name}" if name == found else None)
+    assert about(f"{program}: ") == ("note", f"{program}: /there/{found}.")
     monkeypatch.setattr(shutil, "which", lambda name: None)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
-    severity, sentence = about(f"{program} is missing: ")
-    assert severity == "warning" and sentence.endswith(f"install the system's package {package}.")
+    told, sentence = about(f"{program} is missing: ")
+    assert (told, need in sentence) == (severity, True) and sentence.endswith(f"; install {remedy}.")
 
 
 @pytest.mark.hard_case("`sadgs-doctor` in an environment with `SADGS_TRITON=0`", "a warning names the variable")
