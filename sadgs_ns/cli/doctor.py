@@ -80,10 +80,7 @@ def check_machine() -> Iterator[Finding]:
 
 
 def _load_torchvision() -> None:
-    """Load the compiled part of torchvision, which raises an error if it is for another torch.
-
-    Importing all of torchvision takes two seconds more, because it imports torch's compiler.
-    """
+    """Load torchvision's compiled part, which may be for another torch; all of it would take two seconds more."""
     import torch
 
     spec = importlib.util.find_spec("torchvision")

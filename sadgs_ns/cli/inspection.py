@@ -102,10 +102,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:
-    """Add up the loss's screen gradients of all training views, by which AbsGS decides, as `empty_gradients`.
-
-    `progress` wraps the numbers of the views.
-    """
+    """Add up the loss's screen gradients of all training views, by which AbsGS decides, as `empty_gradients`."""
     model = pipeline.model
     gradients = empty_gradients(model.num_points, pipeline.device)
     for index in progress(range(len(pipeline.datamanager.train_dataset))):

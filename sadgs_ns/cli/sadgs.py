@@ -109,8 +109,7 @@ class PhotosToSplat:
     def _read_settings(self) -> None:
         """Read the settings that the folder was begun with, and replace those that nothing depends on yet.
 
-        Raises:
-            InputError: If the others differ from the options, or the folder is something else.
+        Raise InputError if the others differ from the options, or the folder is something else.
         """
         folder, options = self.folder, self.options
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}

@@ -86,10 +86,7 @@ class Similarity:
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:
-    """Return the real, orthonormal spherical harmonics of unit vectors, in the order and with the signs of 3DGS.
-
-    The highest degree is 0 … 3. [..., 3] → [..., (degree + 1)²]
-    """
+    """Return real, orthonormal harmonics of unit vectors to degree ≤ 3, as in 3DGS. [..., 3] → [..., (degree + 1)²]"""
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
 
     def root(numerator: float, denominator: float) -> float:

@@ -101,10 +101,7 @@ def widest_bytes(params: Params) -> int:
 
 
 def step_bytes(num_gaussians: int, size: StepSize, device: torch.device) -> dict[str, float]:
-    """Bytes that a step takes at its peak in each phase ("tile lists", "loss", "backward"), besides `kept_bytes`.
-
-    All Gaussians count, visible or not.
-    """
+    """Bytes that a step of Gaussians, visible or not, takes at its peak in each phase, besides `kept_bytes`."""
     return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, device).items()}
 
 

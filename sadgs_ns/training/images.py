@@ -36,10 +36,7 @@ def stack(tensors: Sequence[Tensor]) -> Tensor:
 
 
 def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: torch.device) -> Tensor | None:
-    """Return the masks of views of one size (H, W), of ones where a view has none, or None if none has one.
-
-    bool [V, H, W, 1], on the device
-    """
+    """Return masks of views of one size (H, W), ones where a view has none; None if no view has. bool [V, H, W, 1]"""
     if not any("mask" in view for view in data):
         return None
     everything = torch.ones((*size, 1), dtype=torch.bool, device=device)

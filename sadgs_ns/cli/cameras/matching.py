@@ -103,10 +103,7 @@ def similar_photos(database: Path, device: torch.device | None) -> list[tuple[st
 
 
 def write_matches(database: Path, pairs: Sequence[tuple[str, str]], device: torch.device, stage: str) -> None:
-    """Match pairs of photos that have no matches in COLMAP's database yet, and write those there, unverified.
-
-    The progress of the stage is reported.
-    """
+    """Match pairs of photos that have no matches in COLMAP's database yet, and write those there, unverified."""
     with pycolmap.Database.open(database) as opened:
         ids = {image.name: image.image_id for image in opened.read_all_images()}
 

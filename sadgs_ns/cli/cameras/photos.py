@@ -68,10 +68,7 @@ def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[st
 
 
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
-    """Read and decode photos, because COLMAP takes the missing end of a file for black pixels.
-
-    Raise InputError, which names them, if some cannot be decoded.
-    """
+    """Read and decode photos, since COLMAP takes a missing end for black; raise InputError that names broken ones."""
     photos: list[Photo] = []
     broken: list[str] = []
 

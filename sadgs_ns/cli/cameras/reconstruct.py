@@ -110,10 +110,7 @@ def wake_gpu() -> torch.device | None:
 
 
 def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
-    """Hold out every tenth panorama or photo, from the fifth, in a `transforms.json`; of fewer nerfstudio chooses.
-
-    It would hold out single views of a panorama.
-    """
+    """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
     described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
     names = in_order([frame["file_path"] for frame in described["frames"]])
     whole = {name: first.get(name.removeprefix("images/"), name) for name in names}

@@ -50,10 +50,7 @@ def read_frames(video: Path) -> Iterator[np.ndarray]:
 
 
 def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the number of each of `count` stretches of a video of `total` frames, and its sharpest frame, BGR.
-
-    The sharpest is the one whose Laplacian varies most.
-    """
+    """Yield the number of each of `count` stretches of a video, and its frame, BGR, whose Laplacian varies most."""
     import cv2
 
     stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)

@@ -188,10 +188,7 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
 
 
 def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
-    """Count SfM points [P, 3], and check whether the views, if there are any, can see them.
-
-    `remedy` ends the sentence about points that are not sound.
-    """
+    """Count SfM points [P, 3], and check whether the views can see them; `remedy` ends a sentence on broken ones."""
     if not np.isfinite(positions).all():
         yield fault(f"{path} has NaN or infinity in a point: {remedy}.")
     elif len(positions) == 0:
@@ -225,10 +222,7 @@ def _check_distances(positions: NDArray[np.floating], views: Sequence[View], pat
 
 
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
-    """Return the share of the views, in [0, 1], that have any of the points [P, 3] on their image or not far beside it.
-
-    Of many views and points, only every nth is looked at.
-    """
+    """Return the share of the views that have any of the points [P, 3] on their image or not far beside it."""
     positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
     views = views[:: len(views) // 50 + 1]
     seeing = 0

@@ -75,10 +75,7 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
 
 
 def check_names(names: Iterable[str], source: Path) -> None:
-    """Raise InputError for the first image of a source whose name leaves its folder, or that a shell would act on.
-
-    nerfstudio gives its downscaled copies these names, and has a shell make them.
-    """
+    """Raise InputError for the first image whose name leaves its folder, or that nerfstudio's shell would act on."""
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
             raise InputError(f"{source}: image {name!r} lies outside the folder of images: move it there.")
