@@ -38,16 +38,9 @@ def drawn(radii: Tensor, means2d: Tensor) -> Tensor:
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    width: int,
-    height: int,
-    near_plane: float = NEAR_PLANE,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = NEAR_PLANE,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Project Gaussians into pinhole cameras (render/types.py) differentiably, as `gsplat.rasterization` does.
 
     Return radii, means2d, depths and conics as `render.types.Projected` has them. What is not drawn has radius zero,

@@ -1,8 +1,7 @@
 """One HTML file that opens without a network: PlayCanvas's SuperSplat viewer, with the Gaussians as SOG inside.
 
-`@playcanvas/splat-transform`, a program for Node.js, makes the page of a single Gaussian, so that Node must be there
-when a file is written, and a network the first time. The page's content is replaced, because SOG is written here in a
-fraction of that program's time.
+`@playcanvas/splat-transform`, a program for Node.js, makes the page of a single Gaussian, with a network the first
+time. The page's content is then replaced, because SOG is written here in a fraction of that program's time.
 """
 
 from __future__ import annotations

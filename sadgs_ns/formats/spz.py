@@ -6,9 +6,8 @@ to −10 … 5.94 and have steps of 1/16, opacities have 8 bits, colours steps o
 and have steps of 1/32; with those of Niantic's own writer, 1/16 in degree 1 and 1/8 above, most of what a short run
 learns there would be zero.
 
-Axes are those of the PLY, as a record of Adobe's at the end says. Without it some readers take a file's axes for a
-PLY's (splat-transform from version 3, SuperSplat) and others for OpenGL's, half a turn around x away (Niantic's library
-and splat-transform 2 before a PLY is written). With it all of these leave the SPZ where the PLY is.
+Axes are those of the PLY, as a record of Adobe's at the end says. Without it some readers, such as Niantic's library,
+take a file's axes for OpenGL's, half a turn around x away.
 """
 
 from __future__ import annotations

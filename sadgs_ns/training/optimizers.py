@@ -50,9 +50,8 @@ class AdamUpdate:
         self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
         self._optimizers = {name: adam for chosen in alike.values() for name, adam in chosen.items()}
         self._groups = [adam.param_groups[0] for adam in self._optimizers.values()]
-        self.parameters: dict[str, Tensor] = {
-            n: adam.param_groups[0]["params"][0] for n, adam in self._optimizers.items()
-        }
+        present = (group["params"][0] for group in self._groups)
+        self.parameters: dict[str, Tensor] = dict(zip(self._optimizers, present, strict=True))
         self.device = next(iter(self.parameters.values())).device
         self._triton = use_triton(self.device)
         self._states = [self._optimizers[name].state[parameter] for name, parameter in self.parameters.items()]

@@ -55,10 +55,9 @@ class SadgsPipeline(VanillaPipeline):
         backend = self.model.backend  # raises InputError if it cannot work
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
-        if config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference":
-            line = choose_image_storage(self.datamanager, self.device)
-            if line is not None:
-                note(line)
+        loads_images = config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference"
+        if loads_images and (line := choose_image_storage(self.datamanager, self.device)):
+            note(line)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             told = f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}"

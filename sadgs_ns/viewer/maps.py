@@ -151,19 +151,13 @@ def structure_ellipses(structure_tensor: Tensor, frequency_constant: float = FRE
     )
 
 
-def draw_ellipses(
-    image: Picture,
-    structure_tensor: Tensor,
-    frequency_constant: float = FREQUENCY_CONSTANT,
-    size: tuple[int, int] | None = None,
-) -> Picture:
-    """Draw S̄⁻¹ as ellipses over a dark grey copy of an image. Both are [H, W, 3].
+def draw_ellipses(image: Picture, structure_tensor: Tensor, constant: float, size: tuple[int, int]) -> Picture:
+    """Draw S̄⁻¹ [H, W, 3] as ellipses over a dark grey copy of its image, of this height and width in px.
 
-    A circle as wide as the grid's spacing has the coarsest wavelength on both axes. `size` is the height and width of
-    the drawing in px; None keeps the image's.
+    A circle as wide as the grid's spacing has the coarsest wavelength on both axes. `constant` is c in 1/px.
     """
-    ellipses = structure_ellipses(structure_tensor, frequency_constant)
-    height, width = image.shape[:2] if size is None else size
+    ellipses = structure_ellipses(structure_tensor, constant)
+    height, width = size
     enlarge_x, enlarge_y = width / image.shape[1], height / image.shape[0]
     picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if enlarge_x < 1 else cv2.INTER_LINEAR)
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)

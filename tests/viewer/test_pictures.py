@@ -65,7 +65,7 @@ def test_without_texture_there_is_no_wavelength_and_no_ellipse():
     assert period.isnan().all()
     assert (PERIOD(period) == PERIOD(period)[0, 0]).all() and PERIOD(period)[0, 0].tolist() == [0, 0, 0]
     assert len(maps.structure_ellipses(structure_tensor(flat)).centers) == 0
-    drawn = maps.draw_ellipses(color_scales.to_picture(flat), structure_tensor(flat))
+    drawn = maps.draw_ellipses(color_scales.to_picture(flat), structure_tensor(flat), 0.75, (HEIGHT, WIDTH))
     assert len(np.unique(drawn)) == 1
 
 
@@ -79,7 +79,7 @@ def test_masked_pixels_are_drawn_as_those_without_texture():
     ellipses = maps.structure_ellipses(tensor)
     assert len(ellipses.centers) > 0 and ellipses.centers[:, 0].min() > WIDTH / 2
     assert len(maps.structure_ellipses(torch.full_like(tensor, torch.nan)).centers) == 0
-    maps.draw_ellipses(color_scales.to_picture(image), tensor)
+    maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, (HEIGHT, WIDTH))
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 135])
@@ -115,7 +115,7 @@ def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatc
 def test_images_of_any_size_can_be_drawn(size: tuple[int, int]):
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0))
     tensor = structure_tensor(image)
-    assert maps.draw_ellipses(color_scales.to_picture(image), tensor).shape == (*size, 3)
+    assert maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, size).shape == (*size, 3)
     assert PERIOD(maps.texture_period(tensor)).shape == (*size, 3)
 
 

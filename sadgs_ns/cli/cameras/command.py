@@ -1,8 +1,7 @@
 """`sadgs-process PHOTOS_OR_VIDEO OUT`: from photos to a scene that `ns-train sadgs --data OUT` reads, with pycolmap.
 
 OUT holds `images/`, `transforms.json`, `sparse_pc.ply` and COLMAP's model in `sparse/0`. `OUT/work` holds what an
-interrupted run needs to go on. When the scene is finished, `settings.json` stays there, by which the command knows it
-again; and, for photos that are added later, `database.db` with features and matches, and the model before undistortion.
+interrupted run needs to go on, and of a finished scene what photos that are added later need.
 """
 
 from __future__ import annotations
