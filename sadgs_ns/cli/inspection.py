@@ -211,15 +211,11 @@ def inspect_run(
     Raise InputError as `load_run` and `get_view` before anything is written, and WriteError if a file cannot be.
     """
     pipeline, iterations = load_run(config, load_step, data)
-    model, shown = pipeline.model, get_view(pipeline, view, split)
+    model, shown, views = pipeline.model, get_view(pipeline, view, split), len(pipeline.views)
     eta, gradient = (f"{what} all training views" for what in ("η in", "gradients of"))
     statistics = observe_training_views(pipeline.structure_cache, partial(track, transient=True, description=eta))
     gradients = screen_gradients(pipeline, partial(track, transient=True, description=gradient))
-    print(
-        f"{config}: {model.num_points} Gaussians after {iterations} iterations. In {len(pipeline.views)} training "
-        f"views {int((statistics['n_total'] > 0).sum())} were observed, "
-        f"{int((statistics['eta_max'] > 1).any(dim=1).sum())} with η over 1 in one of them."
-    )
+    print(f"{config}: {model.num_points} Gaussians after {iterations} iterations on {views} training views.")
     folder = output or (config if config.is_dir() else config.parent) / "inspect"
     pictures = {name: [panel] for name, panel in view_panels(pipeline, shown, statistics).items()}
     pictures["step"] = step_panels(model, shown, conventional_step(model, gradients), structure_step(model, statistics))

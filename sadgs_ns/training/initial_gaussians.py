@@ -33,10 +33,8 @@ def initial_gaussians(
         points, colors = seed_points[0].float(), seed_points[1].float() / 255.0
         plausible = plausible_points(points)  # [P]
         if not plausible.all():
-            warn(
-                f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite "
-                f"or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them."
-            )
+            told = f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points"
+            warn(f"{told}, which are not finite or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.")
             points, colors = points[plausible], colors[plausible]
         start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
         sfm = len(points)

@@ -118,10 +118,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
         f"about {times:,} time{'s' * (times != 1)}."
     )
     if config.max_num_iterations is None:
-        note(
-            f"The number of views and --pipeline.effort {effort:g} decide this: 0.5 is a draft of half as many "
-            "renderings, 2 resolves more, with more Gaussians and, where views are many, renderings."
-        )
+        note(f"The number of views and --pipeline.effort {effort:g} decide this: 0.5 is a draft, and 2 resolves more.")
     if requested is not None and requested > in_step:
         told = f"pipeline.views_per_iteration is {requested}, but there are {views} training views"
         warn(f"{told}: all are taken each time.")

@@ -67,8 +67,7 @@ def test_the_number_of_views_and_the_effort_decide_what_is_not_set_by_hand(
     assert pipeline.model.strategy == config.pipeline.model.strategy.for_run(plan.iterations)
     assert f": {plan.iterations:,} iterations of 1 view, so that each view is rendered about" in printed
     assert (
-        "\nThe number of views and --pipeline.effort 0.5 decide this: 0.5 is a draft of half as many renderings, 2 "
-        in printed
+        "\nThe number of views and --pipeline.effort 0.5 decide this: 0.5 is a draft, and 2 resolves more." in printed
     )
     assert config.max_num_iterations is None, "config.yml says what was asked for"
 

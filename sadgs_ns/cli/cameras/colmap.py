@@ -60,9 +60,8 @@ def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
         problem = f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there)"
         return OSError(f"{problem}: make room, and run the same command again to resume.")
     if error.exitcode == -signal.SIGKILL:
-        return RunError(
-            f"COLMAP was killed while it worked on {stage}, most likely for want of memory: close other programs, or "
-            "give it smaller photos, and run the same command again to resume."
-        )
+        problem = f"COLMAP was killed while it worked on {stage}, most likely for want of memory"
+        remedy = "close other programs, or give it smaller photos, and run the same command again to resume"
+        return RunError(f"{problem}: {remedy}.")
     why = f"({told[-1]})" if told else f"(exit code {error.exitcode})"
     return RunError(f"COLMAP failed while it worked on {stage} {why}; run the same command to try again.")
