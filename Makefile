@@ -1,4 +1,4 @@
-# From a bare checkout with Python 3.10-3.12, a C compiler and make: `make demo`, `make test`, `make gate`, `make lint`,
+# From a bare checkout with Python 3.10-3.13, a C compiler and make: `make demo`, `make test`, `make gate`, `make lint`,
 # and `make test-portable`, the tests of the method and the splatter as a plainer processor rounds.
 
 PYTHON ?= python3
@@ -42,8 +42,8 @@ docs: $(STAMP)
 
 # The stamp is written last, so an interrupted installation is taken up again.
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' || { \
-	  echo 'sadgs_ns needs Python 3.10, 3.11 or 3.12, and "$(PYTHON)" is not one; name one: make PYTHON=python3.11' >&2; \
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))' || { \
+	  echo 'sadgs_ns needs Python 3.10, 3.11, 3.12 or 3.13, and "$(PYTHON)" is not one; name one: make PYTHON=python3.11' >&2; \
 	  exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'

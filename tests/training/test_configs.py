@@ -336,7 +336,7 @@ def test_continuous_integration_runs_what_ci_run_does_on_every_python():
     assert [step["run"] for step in job["steps"] if "run" in step] == [".ci/run"]
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
     named = [line.rpartition(" ")[2] for line in project["classifiers"] if re.search(r":: 3\.\d+$", line)]
-    assert job["strategy"]["matrix"]["python-version"] == named == ["3.10", "3.11", "3.12"]
+    assert job["strategy"]["matrix"]["python-version"] == named == ["3.10", "3.11", "3.12", "3.13"]
 
 
 def test_pre_commit_checks_what_make_lint_does():
