@@ -8,7 +8,7 @@ run's near plane. Real surfaces near a path have SfM points.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -71,11 +71,6 @@ class CameraPaths:
     def surfaces(self) -> KDTree:
         """The points, to be searched for the nearest. Comparing all pairs took 40 % of castle's loop on a GPU."""
         return KDTree(self.points.cpu().numpy())
-
-    def to(self, device: torch.device) -> CameraPaths:
-        """Return the same on a device."""
-        moved = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **moved)
 
     @torch.no_grad()
     def haze(

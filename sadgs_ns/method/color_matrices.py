@@ -12,11 +12,6 @@ from torch import Tensor
 from sadgs_ns.kernels import use_triton
 
 
-def identities(views: int) -> Tensor:
-    """Return matrices that change nothing. [V, 3, 4]"""
-    return torch.eye(3, 4).repeat(views, 1, 1)
-
-
 def anchored(
     matrices: Tensor,  # [V, 3, 4]
     views: Tensor,  # [C]

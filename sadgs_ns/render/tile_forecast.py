@@ -76,7 +76,10 @@ class TileForecast:
             if visit.epoch < self._epoch and not changes:
                 return None
             total += max([1.0, *changes]) * visit.num_pairs
-        rounded = _round_up(int(MARGIN * total) + 1, 2 if self.round_to_powers else 16)
+        number = int(MARGIN * total) + 1
+        # So many steps of equal size divide the way from a power of two to the next.
+        step = max((1 << number.bit_length() - 1) // (2 if self.round_to_powers else 16), _LEAST_STEP)
+        rounded = -(-number // step) * step
         return rounded if rounded <= MOST_PAIRS else None
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:
@@ -97,9 +100,3 @@ class TileForecast:
             if call.capacity is not None and sum(counts) > call.capacity:
                 lost += call.views
         return lost
-
-
-def _round_up(number: int, parts: int) -> int:
-    """Round up to one of the steps that divide the way from a power of two to the next into equal parts."""
-    step = max((1 << number.bit_length() - 1) // parts, _LEAST_STEP)
-    return -(-number // step) * step

@@ -19,7 +19,6 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
-from sadgs_ns.method.color_matrices import identities
 from sadgs_ns.method.initialization import camera_extent, neighbour_scales
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.near_plane import scene_near_plane
@@ -78,7 +77,7 @@ class SadgsModel(SplatfactoModel):
         self.viewer_outputs: Callable[[Cameras, dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.world = World()
         if config.color_model == "affine":
-            self.color_matrices = torch.nn.Parameter(identities(self.num_train_data))
+            self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
             # An index made in a step would have to be copied to the device there.
             self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
@@ -371,13 +370,13 @@ class SadgsModel(SplatfactoModel):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
-        self.strategy_state = {
-            key: value.to(self.device) if isinstance(value, Tensor) else value
-            for key, value in state["strategy_state"].items()
-        }
-        if "camera_paths" in state["strategy_state"]:
-            paths = CameraPaths(**state["strategy_state"]["camera_paths"])
-            self.strategy_state["camera_paths"] = paths.to(self.device)
+
+        def on_device(values: dict[str, Any]) -> dict[str, Any]:
+            return {key: v.to(self.device) if isinstance(v, Tensor) else v for key, v in values.items()}
+
+        self.strategy_state = on_device(state["strategy_state"])
+        if (paths := self.strategy_state.get("camera_paths")) is not None:
+            self.strategy_state["camera_paths"] = CameraPaths(**on_device(paths))
         self.average.load_state_dict(state["average"], self.device)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.color_matrices import correct_colors, identities
+from sadgs_ns.method.color_matrices import correct_colors
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
@@ -104,7 +104,7 @@ class Stages:
     def colors(self) -> None:
         shape = self.views, _SIZE, _SIZE
         renders, alphas = (torch.zeros((*shape, k), device=self.device, requires_grad=True) for k in (3, 1))
-        matrices = identities(self.views).to(self.device).requires_grad_()
+        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1).requires_grad_()
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def update(self) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import color_matrices
-from sadgs_ns.method.color_matrices import anchored, correct_colors, identities
+from sadgs_ns.method.color_matrices import anchored, correct_colors
 
 fused = pytest.importorskip("sadgs_ns.kernels.color_matrices", reason="Triton is not installed")
 
@@ -22,7 +22,7 @@ def random_views(views: int, height: int, width: int) -> tuple[Tensor, Tensor, T
     generator = torch.Generator().manual_seed(height)
     shapes = ((views, height, width, 3), (views, height, width, 1), (views, 3, 4), (views, height, width, 3))
     render, alpha, changes, upstream = (torch.rand(shape, generator=generator) for shape in shapes)
-    return render, alpha, identities(views) + 0.3 * (changes - 0.5), upstream - 0.5
+    return render, alpha, torch.eye(3, 4) + 0.3 * (changes - 0.5), upstream - 0.5
 
 
 def reference(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.M
 
 
 def test_the_mean_of_all_views_matrices_is_the_identity():
-    matrices = (identities(7) + torch.randn((7, 3, 4), generator=torch.Generator().manual_seed(0))).requires_grad_()
+    matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=torch.Generator().manual_seed(0))).requires_grad_()
     every = anchored(matrices, torch.arange(7))
     torch.testing.assert_close(every.mean(dim=0), torch.eye(3, 4), atol=1e-6, rtol=0)
     torch.testing.assert_close(every - every[:1], (matrices - matrices[:1]).detach() + 0 * every, atol=1e-6, rtol=0)
@@ -81,7 +81,7 @@ def test_the_mean_of_all_views_matrices_is_the_identity():
 
 def test_nothing_changes_at_the_start():
     render, alpha, _, _ = random_views(2, 4, 5)
-    start = anchored(identities(9), torch.tensor([8, 3]))
+    start = anchored(torch.eye(3, 4).repeat(9, 1, 1), torch.tensor([8, 3]))
     assert torch.equal(correct_colors(render, alpha, start), render)
 
 
@@ -99,7 +99,7 @@ def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure()
     truth = 0.1 + 0.6 * torch.rand((1, 8, 8, 3), generator=generator)
     gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.4])
     scene = torch.nn.Parameter(torch.full_like(truth, 0.4))
-    matrices = torch.nn.Parameter(identities(5))
+    matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(5, 1, 1))
     optimizer = torch.optim.Adam([{"params": [scene], "lr": 0.01}, {"params": [matrices], "lr": 0.005}])
     alpha = torch.ones((1, 8, 8, 1))
     for step in range(4000):

@@ -16,12 +16,12 @@ from PIL import Image
 
 from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
 from sadgs_ns.cli.cameras.photos import threads
-from sadgs_ns.cli.cameras.plan import MAX_SIDE, searched_pixels
 from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.method.host_memory import available_host_bytes
 
 MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
+MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
@@ -135,6 +135,6 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
     """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
-    pixels = max(map(searched_pixels, sizes), default=1.0)
+    pixels = max((w * h * min(1.0, MAX_SIDE / max(w, h, 1)) ** 2 for w, h in sizes), default=1.0)
     at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
     return max(1, int(min(os.cpu_count() or 1, at_a_time)))

@@ -7,7 +7,6 @@ from typing import Literal
 
 EXHAUSTIVE_LIMIT = 40  # Most photos for which every pair is matched; twice the photos take four times as long
 NEIGHBORS = 20  # Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)
-MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
 _PAIRS_PER_PHOTO = {"sequential": 16, "similar": NEIGHBORS}  # Other photos that each photo is matched with, at most
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 
@@ -42,12 +41,6 @@ def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:
     if asked != "auto":
         return asked
     return "sequential" if is_video else "exhaustive" if photos <= EXHAUSTIVE_LIMIT else "similar"
-
-
-def searched_pixels(size: tuple[int, int]) -> float:
-    """Return the number of pixels in which features of a photo of this width and height are searched."""
-    width, height = size
-    return width * height * min(1.0, MAX_SIDE / max(width, height, 1)) ** 2
 
 
 def pairs_to_match(photos: int, matching: Matching, known: int = 0) -> int:

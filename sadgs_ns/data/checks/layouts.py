@@ -51,11 +51,6 @@ class ParserOptions:
             raise InputError(f"downscale-factor must be at least 1, got {self.downscale_factor}.")
 
 
-def find_reconstruction(data: Path) -> Path | None:
-    """Return the folder of the COLMAP reconstruction to read, the first of `find_reconstructions`, or None."""
-    return next(iter(find_reconstructions(data)), None)
-
-
 def find_reconstructions(data: Path) -> dict[Path, list[str]]:
     """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
 
@@ -82,7 +77,8 @@ def _model_folders(data: Path) -> list[Path]:
 def find_cameras(data: Path) -> Path | None:
     """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
     files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
-    if not any(file.is_file() for file in files) and (model := find_reconstruction(data)) is not None:
+    if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
+        model = next(iter(models))
         files = [data / model / f"images.{colmap.model_kind(data / model)}"]
     return next((file for file in files if file.is_file()), None)
 

@@ -15,7 +15,7 @@ from sadgs_ns.data import IMAGE_SUFFIXES, colmap
 from sadgs_ns.data.checks import geometry
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
 from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, image_size, no_copies, scaled_size
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstruction, no_layout
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstructions, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.data.text import read_text
@@ -73,8 +73,8 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
 
 
 def _no_transforms(data: Path, path: Path) -> str:
-    if (found := find_reconstruction(data)) is not None:
-        problem = f"{path} does not exist, but {data / found} holds a COLMAP reconstruction"
+    if models := find_reconstructions(data):
+        problem = f"{path} does not exist, but {data / next(iter(models))} holds a COLMAP reconstruction"
         return f"{problem}: leave `nerfstudio-data` out of the command."
     return no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}."
 
