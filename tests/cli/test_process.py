@@ -590,16 +590,39 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str
     assert main([str(photos), str(tmp_path / "out")]) == 130 and taken == [["a.png", "b.png", "c.png"]]
 
 
-def test_names_with_spaces_are_matched_by_colmap_s_own_function(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    neighbours: list[Path] = []  # of a film: these photos' neighbours stand apart
-    monkeypatch.setattr(pycolmap, "match_sequential", lambda database, **options: neighbours.append(database))
-    match(["a 1.png", "a 2.png"], tmp_path / "db", "sequential", None)
-    assert neighbours == [tmp_path / "db"]
+def test_names_with_spaces_are_matched_as_others_also_after_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """COLMAP separates the names in a list of pairs by spaces."""
+    names, database = ["a 1.png", "b c/a 2.png", "d.png"], tmp_path / "database.db"
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        noise = np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
+        Image.fromarray(noise).resize((512, 512)).save(tmp_path / name)
+    features.extract(tmp_path, [names], database)
+
+    def names_in_database() -> list[str]:
+        with pycolmap.Database.open(database) as opened:
+            return sorted(image.name for image in opened.read_all_images())
+
+    def stop(*_: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pycolmap, "match_image_pairs", stop)
+        with pytest.raises(KeyboardInterrupt):
+            match(names, database, "exhaustive", None)
+    features.extract(tmp_path, [names], database)
+    assert names_in_database() == names
+    match(names, database, "exhaustive", None)
+    assert names_in_database() == names
+    with pycolmap.Database.open(database) as opened:
+        assert opened.num_matched_image_pairs() == 3 and opened.num_verified_image_pairs() == 3
 
 
 @pytest.mark.hard_case(
     "`--matching sequential` with photo 9 and photo 10",
-    "in the order of their numbers (names with spaces: COLMAP's own order)",
+    "in the order of their numbers",
 )
 def test_numbered_photos_are_neighbours_in_the_order_of_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", lambda database, **options: None)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.cameras.features import extract
+from sadgs_ns.cli.cameras.features import NO_SPACE, extract, rename_images
 from sadgs_ns.cli.cameras.panoramas import rotations
 from sadgs_ns.cli.cameras.photos import empty_folder, in_order
 from sadgs_ns.cli.cameras.plan import Matching, Summary
@@ -158,12 +158,6 @@ def match(
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
     progress(stage, 0, 1)
-    # COLMAP separates the names in a list of pairs by spaces.
-    if gpu is None and any(character.isspace() for name in names for character in name):
-        function = pycolmap.match_sequential if matching == "sequential" else pycolmap.match_exhaustive
-        function(database, verification_options=verification)  # It does not report its progress.
-        progress(stage, 1, 1)
-        return
     if matching == "similar":
         from sadgs_ns.cli.cameras.matching import similar_photos
 
@@ -178,11 +172,14 @@ def match(
         # It tries pairs again that did not fit, so all are verified together.
         pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     else:
+        rename_images(database, " ", NO_SPACE)  # COLMAP separates the names in a list of pairs by spaces.
         for start in range(0, len(pairs), _PAIRS):
             progress(stage, start, len(pairs))
-            pair_list.write_text("".join(f"{a} {b}\n" for a, b in pairs[start : start + _PAIRS]), "utf8")
+            listed = ((name.replace(" ", NO_SPACE) for name in pair) for pair in pairs[start : start + _PAIRS])
+            pair_list.write_text("".join("{} {}\n".format(*pair) for pair in listed), "utf8")
             pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
             pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+        rename_images(database, NO_SPACE, " ")
     progress(stage, len(pairs), len(pairs))
 
 
