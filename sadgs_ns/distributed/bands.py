@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -41,11 +40,6 @@ def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:
                 top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
                 bands.append(Band(view, rank, first, last, top, bottom))
     return bands
-
-
-def first_ranks(bands: Sequence[Band]) -> dict[int, int]:
-    """Return for each view the process that composites its first rows."""
-    return {band.view: band.rank for band in reversed(bands)}
 
 
 @lru_cache(maxsize=1024)

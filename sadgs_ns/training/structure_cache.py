@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.distributed.bands import first_ranks, share_rows
+from sadgs_ns.distributed.bands import share_rows
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -66,7 +66,8 @@ class StructureCache:
         self.fill()
         world, data, (height, width) = self.views.model.world, dict(views), self.views.sizes[views[0][0]]
         found = {index: self[index] for index in data if index in self._kept}
-        ranks = first_ranks(share_rows(len(views), height, world.num_ranks))
+        bands = reversed(share_rows(len(views), height, world.num_ranks))
+        ranks = {band.view: band.rank for band in bands}  # those of each view's first rows
         missing = {index: ranks[place] for place, (index, _) in enumerate(views) if index not in found}
         own = [index for index, rank in missing.items() if rank == world.rank]
         found.update(zip(own, self.quantized([data[index] for index in own]), strict=True))

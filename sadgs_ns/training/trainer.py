@@ -95,7 +95,11 @@ class SadgsTrainer(Trainer):
             self.callbacks.append(TrainingCallback(last, lambda step: self._print_next_commands()))
             with processes.local_rank_zero_first(self.world, self.local_rank):
                 compile_kernels(self.pipeline, self.optimizers.optimizers)
-            self.graphed = GraphedSteps(self.pipeline.model) if self._may_graph_steps() else None
+            model = self.pipeline.model
+            # In a graphed step the host must not wait, and cameras must not move.
+            known = self.world.alone and model.backend == "triton" and model.tile_forecast is not None
+            if self.config.cuda_graphs and known and model.camera_optimizer.config.mode == "off":
+                self.graphed = GraphedSteps(model)
         except torch.cuda.OutOfMemoryError as error:
             raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except RuntimeError as error:
@@ -105,12 +109,6 @@ class SadgsTrainer(Trainer):
         except KeyboardInterrupt:
             note(f"SIGINT: {_NOTHING_DONE}")
             raise SystemExit(128 + signal.SIGINT) from None
-
-    def _may_graph_steps(self) -> bool:
-        """Tell whether steps can be CUDA graphs: the host must not wait in them, and cameras must not move."""
-        model = self.pipeline.model
-        known = model.backend == "triton" and model.tile_forecast is not None
-        return self.config.cuda_graphs and self.world.alone and known and model.camera_optimizer.config.mode == "off"
 
     def _print_next_commands(self) -> None:
         """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""

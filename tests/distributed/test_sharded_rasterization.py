@@ -11,7 +11,7 @@ from ranks import run_ranks
 from sharded_scene import GAUSSIANS, HEIGHT, inputs, splats, weights
 from torch import Tensor
 
-from sadgs_ns.distributed.bands import ROWS, first_ranks, share_rows, views_of_rank
+from sadgs_ns.distributed.bands import ROWS, share_rows, views_of_rank
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
@@ -111,8 +111,6 @@ def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: i
         assert all((b.first, b.last, b.top, b.bottom) == (0, height, 0, height) for b in bands)
     shares = [sum(b.last - b.first for b in bands if b.rank == rank) for rank in range(ranks)]
     assert max(shares) - min(shares) <= max(2 * ROWS, height if height < ROWS else 0)
-    firsts = first_ranks(bands)
-    assert [firsts[view] for view in range(views)] == [next(b.rank for b in bands if b.view == v) for v in range(views)]
 
 
 def test_views_of_several_sizes_are_shared_out_size_by_size():
