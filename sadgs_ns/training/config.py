@@ -312,11 +312,9 @@ class SadgsTrainerConfig(TrainerConfig):
         preset = all_methods.get(self.method_name or "", self)
         given = {name for name, value in vars(preset).items() if vars(self)[name] != value}
         if lost := sorted(given - {"load_config"}):
-            raise InputError(
-                f"With --load-config all options come from its file, and others are not read, here of "
-                f"{', '.join(lost)}: leave them out, change them in the file, or give --load-dir with the run's folder "
-                "and all options instead of --load-config."
-            )
+            problem = f"With --load-config all options come from its file, and not {', '.join(lost)}"
+            remedy = "leave these out, change them in the file, or give --load-dir with the run's folder instead"
+            raise InputError(f"{problem}: {remedy}.")
 
     def print_to_terminal(self) -> None:
         """Print nothing. nerfstudio prints all options, which `config.yml` holds, before a run is known to start."""

@@ -121,8 +121,6 @@ def _check_sizes(dataset: InputDataset) -> None:
     sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
     for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
         width, height = sizes[index].tolist()
-        raise InputError(
-            f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px, and at least 2 × 2 are "
-            "needed: take a larger image, or scale it down less with pipeline.datamanager.camera-res-scale-factor or "
-            "the parser's downscale-factor."
-        )
+        problem = f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px"
+        remedy = "scale it down less with pipeline.datamanager.camera-res-scale-factor or the parser's downscale-factor"
+        raise InputError(f"{problem}, and at least 2 × 2 are needed: take a larger image, or {remedy}.")

@@ -22,10 +22,8 @@ def initial_gaussians(
     """Return Gaussians of SfM points [P, 3], colours in 0 … 255, or random points, and which are synthetic [N]."""
     if seed_points is None or config.random_init:
         if not config.random_init:
-            warn(
-                f"The data has no SfM points: starting from {config.num_random} random ones in a cube of "
-                f"side {config.random_scale}. A sparse reconstruction (ns-process-data) gives a better splat."
-            )
+            told = f"starting from {config.num_random} random ones in a cube of side {config.random_scale}"
+            warn(f"The data has no SfM points: {told}. A reconstruction (sadgs-process) gives a better splat.")
         points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
         start = starting_points(points, torch.rand((len(points), 3)), faces=False)
         sfm = 0

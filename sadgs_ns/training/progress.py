@@ -56,10 +56,7 @@ def time_left(first: int, step: int, total: int, seconds: float) -> float | None
 
 def cpu_notice(threads: int) -> str:
     """Return what a user should know who trains without a GPU, with so many threads of torch."""
-    text = (
-        "This run trains on the CPU, which is for small scenes and tests: a GPU with CUDA is about a hundred times as "
-        "fast."
-    )
+    text = "This run trains on the CPU, which is for small scenes and tests: a GPU is about a hundred times as fast."
     remedy = "beside other work one is quicker: put OMP_NUM_THREADS=1 before the command."
     return text if threads == 1 else f"{text} It computes with {threads} threads; {remedy}"
 
