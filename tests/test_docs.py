@@ -50,7 +50,7 @@ def test_tables_are_what_their_rows_give(capsys: pytest.CaptureFixture[str]):
 
 
 DOCUMENTS = [CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-BYTES = 111_700
+BYTES = 100_000
 """Most bytes of all documents together. This number may only fall."""
 
 
@@ -132,7 +132,7 @@ def test_the_version_and_its_date_are_the_same_wherever_they_stand():
 
 def test_the_readme_is_read_in_two_minutes():
     lines = (CHECKOUT / "README.md").read_text("utf8").splitlines()
-    assert len(lines) <= 120 and max(map(len, lines)) <= 120
+    assert len(lines) <= 110 and max(map(len, lines)) <= 120
 
 
 def test_all_documents_are_read_in_an_hour():
