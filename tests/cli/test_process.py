@@ -397,6 +397,18 @@ def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
     assert "--max-size must be at least 64 px, or 0 to keep the photos' size" in capsys.readouterr().err
 
 
+@pytest.mark.hard_case(
+    "`a.webp` beside `a.webp.jpg`", "refused, because the first would become the second: rename one; neither is touched"
+)
+def test_a_converted_photo_never_replaces_another_one(tmp_path: Path, capsys):
+    for name, grey in (("a.webp", 90), ("a.webp.jpg", 160), ("b.png", 200)):
+        Image.new("RGB", (320, 240), (grey,) * 3).save(tmp_path / name)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert main([str(tmp_path), str(tmp_path / "scene")]) == 2
+    assert "converted, two photos would be called a.webp.jpg; rename one" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+
+
 @pytest.mark.hard_case("transparent photos", "alpha is kept: the scene's images are RGBA, a line says how many")
 @pytest.mark.hard_case("a folder of WebP (COLMAP reads none), or a mixed one", "converted")
 @pytest.mark.hard_case(

@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import zlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -129,7 +129,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     """Convert photos that COLMAP does not read, turn those that are not upright, and cut panoramas.
 
     The folder `converted` then holds conversions, and links to the other photos, unless it exists already. Return the
-    folder of photos that COLMAP reads, and the photos and views in it.
+    folder of photos that COLMAP reads, and the photos and views in it. Raise InputError if one would replace another.
     """
 
     def converted_name(photo: Photo) -> str:
@@ -138,8 +138,9 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
             return photo.name
         return photo.name + (".png" if photo.has_alpha else ".jpg")
 
-    views = [view for photo in photos for view in photo.views]
-    new = [dataclasses.replace(view, name=converted_name(view)) for view in views]
+    new = [dataclasses.replace(view, name=converted_name(view)) for photo in photos for view in photo.views]
+    if doubles := [name for name, number in Counter(view.name for view in new).items() if number > 1]:
+        raise InputError(f"{folder}: converted, two photos would be called {doubles[0]}; rename one of them.")
     if new == list(photos) and all(photo.is_read and not photo.is_turned for photo in photos):
         return folder, new
     if converted.exists():
@@ -149,8 +150,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     def convert(photo: Photo) -> None:
         source = Path(os.path.realpath(folder / photo.name))
         targets = [partial / converted_name(view) for view in photo.views]
-        target = targets[0]
-        target.parent.mkdir(parents=True, exist_ok=True)
+        targets[0].parent.mkdir(parents=True, exist_ok=True)
         if photo.is_turned or not photo.is_read or photo.is_panorama:
             with Image.open(source) as image:
                 exif = Image.Exif() if image.format == "TIFF" else image.getexif()  # A TIFF's tells of its pixels, too.
@@ -166,9 +166,9 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
                     part.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
             return
         try:
-            target.symlink_to(source)
+            targets[0].symlink_to(source)
         except OSError:  # Some file systems hold no links.
-            shutil.copyfile(source, target)
+            shutil.copyfile(source, targets[0])
 
     with threads() as pool:
         list(pool.map(convert, photos))
