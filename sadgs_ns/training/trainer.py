@@ -176,13 +176,6 @@ class SadgsTrainer(Trainer):
         except torch.cuda.OutOfMemoryError as error:
             full = f"The GPU's memory was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
             raise RunError(f"{full} ({_memory(error)}): {_LESS_MEMORY}; {self._resume}.") from error
-        except OSError as error:
-            if error.errno is None:  # This is a WriteError, or not from the disk.
-                raise
-            # A logger, such as tensorboard's, could not write, perhaps to another disk.
-            if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
-                self.save_checkpoint(self._completed_step)
-            raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
         except RuntimeError as error:
             if isinstance(error, RunError) or self._peers is None or not self._peers.ended():
                 raise
@@ -194,7 +187,7 @@ class SadgsTrainer(Trainer):
         processes.leave()
 
     def _train_until_interrupted(self, total: int) -> None:
-        """Train as nerfstudio does until the last iteration, or until a signal, which saves and raises SystemExit."""
+        """Train as nerfstudio does, unless a signal (SystemExit) or a logger's error stops the run, which saves it."""
         with self._interrupts:
             try:
                 if not self.world.alone:  # Making it as nerfstudio does fails if another process is as fast.
@@ -203,6 +196,13 @@ class SadgsTrainer(Trainer):
                 self._stop_if_diverged()
             except Interrupted as interrupted:
                 self._stop(interrupted, total)
+            except OSError as error:
+                if error.errno is None:  # This is a WriteError, or not from the disk.
+                    raise
+                # A logger could not write, perhaps to another disk, or to a terminal whose SIGHUP is on its way.
+                if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
+                    self.save_checkpoint(self._completed_step)
+                raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
 
     @property
     def _resume(self) -> str:

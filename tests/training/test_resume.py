@@ -12,6 +12,7 @@ starts anew.
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import re
 import shlex
@@ -42,7 +43,7 @@ from scenes import ITERATIONS
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.cameras import camera_positions
-from sadgs_ns.errors import InputError
+from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.training import planning
 from sadgs_ns.training.checkpoints import checkpoint_paths
@@ -300,6 +301,31 @@ def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, m
     assert stopped.value.code == 128 + signal.SIGHUP
     assert checkpoints(trainer) == ["step-000000003.ckpt"]
     assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+
+
+@pytest.mark.hard_case("a write to the terminal fails before SIGHUP comes", "what was trained is saved, SIGHUP or not")
+@pytest.mark.usefixtures("hang_up_by_default")
+def test_a_hang_up_that_follows_a_failed_write_does_not_stop_the_saving(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    trainer, save = set_up(config), torch.save
+    update = trainer._update_viewer_state
+
+    def lost(step: int) -> None:
+        update(step)
+        if step == 3:
+            raise OSError(errno.EIO, "Input/output error")
+
+    def hung_up(*arguments: Any) -> None:
+        assert signal.getsignal(signal.SIGHUP) != signal.SIG_DFL, "it would end this process"
+        send(signal.SIGHUP)
+        save(*arguments)
+
+    monkeypatch.setattr(trainer, "_update_viewer_state", lost)
+    monkeypatch.setattr(torch, "save", hung_up)
+    with pytest.raises(WriteError, match=r"could not be written \(Input/output error; "):
+        trainer.train()
+    assert checkpoints(trainer) == ["step-000000003.ckpt"]
 
 
 def in_terminal_under_nohup(*arguments: Any) -> None:
