@@ -88,15 +88,15 @@ def deviation(cell: Cell, name: str) -> float | None:
 
 
 def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float | None:
-    """Loop seconds at which a run's curve first has the goal's PSNR, SSIM and LPIPS at once.
+    """Loop seconds at which a run's curve first has the goal's PSNR, SSIM and LPIPS at once, as far as it has these.
 
-    Infinity if it never has, None if the run was not measured on its way.
+    Infinity if it never has, None if there is no goal or the run was not measured so on its way.
     """
-    if not run.get("curve"):
+    names, curve = [name for name in DIGITS if goal.get(name) is not None], run.get("curve") or []
+    if not names or not curve or any(point.get(name) is None for point in curve for name in names):
         return None
-    for point in run["curve"]:
-        measured = [(point[name], goal[name], name) for name in DIGITS if goal[name] is not None]
-        if all(here is not None and (here <= end if name == "lpips" else here >= end) for here, end, name in measured):
+    for point in curve:
+        if all(point[name] <= goal[name] if name == "lpips" else point[name] >= goal[name] for name in names):
             return point["seconds"]
     return math.inf
 

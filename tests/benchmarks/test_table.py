@@ -43,7 +43,7 @@ def test_the_command_prints_the_table_and_draws_a_plot(tmp_path: Path, capsys: p
     lines = write_lines(tmp_path / "r.jsonl", rows)
     assert bench.main(["table", lines, "--reference", "b", "--plots", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "| fox | a | 20.0, 21.0 | 0.102 | never | 30.00, 31.00 | – | – |" in printed and "| _hidden |" in printed
+    assert "| fox | a | 20.0, 21.0 | 0.102 | – | 30.00, 31.00 | – | – |" in printed and "| _hidden |" in printed
     assert "- south & west, broken, seed 0 failed: RuntimeError: out of <memory>.\n" in printed
     with Image.open(tmp_path / "out" / "quality-time.png") as image:
         assert image.format == "PNG" and image.width == round(7.2 * 200)
@@ -76,6 +76,11 @@ def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_referen
     assert table.Run("fox", "never", [never], [THEIRS]).matched() == "never"
     assert table.Run("fox", "alone", [ours]).matched() == "–"
     assert table.Run("fox", "no curve", [[*ours, result()]], [THEIRS]).matched() == "–"
+    assert table.Run("fox", "no reference here", [ours], [[]]).matched() == "–"
+    without_lpips = [{**run, "curve": [{**point, "lpips": None} for point in run["curve"]]} for run in ours]
+    assert table.Run("fox", "without LPIPS on its way", [without_lpips], [THEIRS]).matched() == "–"
+    theirs = [{name: value for name, value in run.items() if name != "lpips"} for run in THEIRS]
+    assert table.Run("fox", "to a reference without LPIPS", [without_lpips], [theirs]).matched() == "1.5"
 
 
 def test_the_spread_is_the_standard_deviation_pooled_over_folds_and_needs_three_seeds():
