@@ -602,11 +602,12 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str
     assert main([str(photos), str(tmp_path / "out")]) == 130 and taken == [["a.png", "b.png", "c.png"]]
 
 
-def test_names_with_spaces_are_matched_as_others_also_after_an_interruption(
+@pytest.mark.hard_case("photos whose names hold spaces or begin with #, on a CPU", "matched as others")
+def test_names_that_colmap_would_not_read_in_a_list_are_matched_as_others_also_after_an_interruption(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """COLMAP separates the names in a list of pairs by spaces."""
-    names, database = ["a 1.png", "b c/a 2.png", "d.png"], tmp_path / "database.db"
+    """In a list of pairs it takes lines that begin with # for comments, and spaces to end names."""
+    names, database = ["#1 2.png", "#3.png", "a 1.png", "b c/a 2.png"], tmp_path / "database.db"
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         noise = np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
@@ -629,7 +630,7 @@ def test_names_with_spaces_are_matched_as_others_also_after_an_interruption(
     match(names, database, "exhaustive", None)
     assert names_in_database() == names
     with pycolmap.Database.open(database) as opened:
-        assert opened.num_matched_image_pairs() == 3 and opened.num_verified_image_pairs() == 3
+        assert opened.num_matched_image_pairs() == 6 and opened.num_verified_image_pairs() == 6
 
 
 @pytest.mark.hard_case(

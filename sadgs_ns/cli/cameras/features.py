@@ -24,7 +24,7 @@ MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; 
 MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
 _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
-NO_SPACE = "\x1f"  # Stands for a space in the names of images while COLMAP reads a list of pairs of them
+LISTED, UNLISTED = str.maketrans(" #", "\x1f\x1e"), str.maketrans("\x1f\x1e", " #")  # Stand-ins in names, and back
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
 _AT_ONCE = 256
 """Photos whose features are kept in memory, at 1 MB each, until COLMAP has read the photos and they are saved."""
@@ -38,7 +38,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     """
     names = list(itertools.chain(*groups, *rigs))
     progress("features", 0, len(names))
-    rename_images(database, NO_SPACE, " ")  # A run that was interrupted while it matched has left them.
+    rename_images(database, UNLISTED)  # A run that was interrupted while it matched has left them.
     with pycolmap.Database.open(database) as opened:
         done_before = {image.name for image in opened.read_all_images() if opened.exists_descriptors(image.image_id)}
     searched, done = [name for name in names if name not in done_before], len(done_before)
@@ -59,12 +59,13 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
                     progress("features", done, len(names))
 
 
-def rename_images(database: Path, old: str, new: str) -> None:
-    """Replace a character in the names of the images in COLMAP's database."""
+def rename_images(database: Path, characters: dict[int, int]) -> None:
+    """Replace characters in the names of the images in COLMAP's database."""
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
-        for image in (image for image in opened.read_all_images() if old in image.name):
-            image.name = image.name.replace(old, new)
-            opened.update_image(image)
+        for image in opened.read_all_images():
+            if (name := image.name.translate(characters)) != image.name:
+                image.name = name
+                opened.update_image(image)
 
 
 def _add_images(

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.cameras.features import NO_SPACE, extract, rename_images
+from sadgs_ns.cli.cameras.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.cli.cameras.panoramas import rotations
 from sadgs_ns.cli.cameras.photos import empty_folder, in_order
 from sadgs_ns.cli.cameras.plan import Matching, Summary
@@ -150,8 +150,7 @@ def match(
 ) -> None:  # fmt: skip
     """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
-    The GPU compares features, if there is one, and COLMAP verifies the matches. Without one COLMAP does all, and a file
-    `pairs.txt` is written beside the database.
+    A GPU compares the features and COLMAP verifies the matches; without one COLMAP does both, by lists in `pairs.txt`.
     """
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
@@ -172,14 +171,14 @@ def match(
         # It tries pairs again that did not fit, so all are verified together.
         pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     else:
-        rename_images(database, " ", NO_SPACE)  # COLMAP separates the names in a list of pairs by spaces.
+        rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
         for start in range(0, len(pairs), _PAIRS):
             progress(stage, start, len(pairs))
-            listed = ((name.replace(" ", NO_SPACE) for name in pair) for pair in pairs[start : start + _PAIRS])
-            pair_list.write_text("".join("{} {}\n".format(*pair) for pair in listed), "utf8")
+            listed = ((a.translate(LISTED), b.translate(LISTED)) for a, b in pairs[start : start + _PAIRS])
+            pair_list.write_text("".join(f"{a} {b}\n" for a, b in listed), "utf8")
             pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
             pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-        rename_images(database, NO_SPACE, " ")
+        rename_images(database, UNLISTED)
     progress(stage, len(pairs), len(pairs))
 
 
