@@ -107,9 +107,9 @@ def _rows(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[st
 
 
 def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
-    """Save a checkpoint whole, and delete the others unless they are to be kept. Raises WriteError."""
+    """Save a checkpoint whole, and delete the run's others unless they are to be kept. Raises WriteError."""
     path = folder / f"step-{step:09d}.ckpt"
-    others = [other for other in folder.glob("*.ckpt") if other != path]
+    others = [other for other in folder.glob(f"step-{9 * '[0-9]'}.ckpt") if other != path]  # no user's copy.ckpt
     with atomic_path(path, beside=folder) as partial:  # nerfstudio takes every file inside for a checkpoint.
         try:
             torch.save(state, partial)

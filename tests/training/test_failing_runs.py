@@ -486,6 +486,16 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
         checkpoints.check_chosen(tmp_path, 9, None)
 
 
+@pytest.mark.hard_case("other files in a run's folder of checkpoints", "passed over, and kept")
+@pytest.mark.parametrize("name", ["notes.txt", "best.ckpt", "step-000000005 (copy).ckpt", "step-000000005.ckpt.bak"])
+def test_a_file_of_the_user_s_among_checkpoints_is_passed_over_and_kept(name: str, saved: Path, tmp_path: Path):
+    for path in (saved.name, name):
+        shutil.copy(saved, tmp_path / path)
+    assert checkpoints.checkpoint_paths(tmp_path, None, None) == [tmp_path / saved.name]
+    checkpoints.write(tmp_path, 9, {}, keep=False)
+    assert {path.name for path in tmp_path.iterdir()} == {"step-000000009.ckpt", name}
+
+
 @pytest.mark.hard_case("no checkpoint in the folder, none of that step", "refused: the steps there are")
 def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"no checkpoint of step 3: give --load-step one of 5\."):
