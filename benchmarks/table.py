@@ -345,7 +345,9 @@ def _few(cell: Cell, base: Cell) -> str:
 
 
 def _range(differences: Sequence[str]) -> str:
-    """The least and the most of differences that are written like those of `_difference`."""
+    """The least and the most of differences that are written like those of `_difference`, if all are known."""
+    if NOTHING in differences:
+        return NOTHING
     ordered = sorted(differences, key=lambda text: float(text.replace("−", "-").lstrip("×")))
     return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1].lstrip('×')}"
 

@@ -312,7 +312,7 @@ class SadgsTrainerConfig(TrainerConfig):
         preset = all_methods.get(self.method_name or "", self)
         given = {name for name, value in vars(preset).items() if vars(self)[name] != value}
         if lost := sorted(given - {"load_config"}):
-            problem = f"With --load-config all options come from its file, and not {', '.join(lost)}"
+            problem = f"With --load-config all options come from its file, and {', '.join(lost)} would be ignored"
             remedy = "leave these out, change them in the file, or give --load-dir with the run's folder instead"
             raise InputError(f"{problem}: {remedy}.")
 

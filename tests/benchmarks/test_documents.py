@@ -131,17 +131,20 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
         {**change, "texts": ["× 2", "theirs"], "scenes": {"fox": ["fox"], "castle": ["castle"]}},
         {**change, "texts": ["× 2, fox", ""], "scenes": ["fox"]},
         {"texts": ["nothing", "theirs"], "remark": "no run"},
+        {**change, "texts": ["without LPIPS", ""], "scenes": ["tree"]},
     ]
+    rows = [*ROWS["sweep.jsonl"], row("tree", "T1", lpips=None), row("tree", "T2", psnr=31.0)]
     tables = {"claims": {"kind": "changes", "header": ["Claim", "Paper"], "remark": "Explanation", "lines": lines}}
-    folder = checkout(tmp_path, tables, {"sweep.jsonl": ROWS["sweep.jsonl"]})
+    folder = checkout(tmp_path, tables, {"sweep.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
-    assert (folder / "README.md").read_text("utf8").splitlines()[4:9] == [
+    assert (folder / "README.md").read_text("utf8").splitlines()[4:10] == [
         "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Standard deviation | Scenes × seeds | Explanation |",
         "| --- | --- | --- | --- | --- | --- |",
         "| × 2 | theirs | −1.00 to −0.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | 0.25 / .0000 / .0000 "
         "| 2 × 1 | why |",
         "| × 2, fox |  | −0.25 / +.0100 / −.0100 / ×1.50 | 0.25 / .0000 / .0000 | 1 × 2 | why |",
         "| nothing | theirs | not measured | – | – | no run |",
+        "| without LPIPS |  | +1.00 / .0000 / – / ×1.00 | – | 1 × 1 | why |",
     ]
 
 

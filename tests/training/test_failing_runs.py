@@ -248,8 +248,8 @@ def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
     with pytest.raises(InputError) as refused:
         dataclasses.replace(preset, load_config=file, max_num_iterations=9, pipeline=config.pipeline)
     assert str(refused.value) == (
-        "With --load-config all options come from its file, and not max_num_iterations, pipeline: leave these out, "
-        "change them in the file, or give --load-dir with the run's folder instead."
+        "With --load-config all options come from its file, and max_num_iterations, pipeline would be ignored: leave "
+        "these out, change them in the file, or give --load-dir with the run's folder instead."
     )
     (tmp_path / "text").write_text("hello")
     (tmp_path / "bytes").write_bytes(b"\xff")
