@@ -61,7 +61,7 @@ def check_machine() -> Iterator[Finding]:
         yield from _check_cuda()
     else:
         built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
-        why = "".join(f" ({str(warning.message).partition('. ')[0]})" for warning in caught)
+        why = "".join(f" ({re.split('[.] (?=[A-Z(])', str(warning.message))[0]})" for warning in caught)
         yield warning(
             f"torch is {built} and sees no GPU{why}: training runs on {os.cpu_count()} CPU cores, which is for small "
             "scenes and tests; for more, install a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and a "

@@ -129,15 +129,21 @@ def test_a_machine_without_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch):
     assert not [s for s in machine() if "its kernels" in s or "CUDA kernels." in s]  # of no use there
 
 
-def test_a_driver_that_is_too_old_for_torch_is_named(monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(
+    ("said", "more"),
+    [
+        ("The NVIDIA driver on your system is too old (found version 12020)", "Please update your GPU driver."),
+        ("CUDA unknown error - perhaps of the environment, e.g. changing CUDA_VISIBLE_DEVICES", "(Triggered in C++.)"),
+    ],
+)
+def test_why_torch_sees_no_gpu_is_told_in_a_sentence(said: str, more: str, monkeypatch: pytest.MonkeyPatch):
     def available() -> bool:
-        said = "CUDA initialization: The NVIDIA driver on your system is too old (found version 12020)"
-        warnings.warn(f"{said}. Please update your GPU driver.", stacklevel=2)
+        warnings.warn(f"CUDA initialization: {said}. {more}", stacklevel=2)
         return False
 
     monkeypatch.setattr(torch.cuda, "is_available", available)
     severity, sentence = about("sees no GPU")
-    assert severity == "warning" and "too old (found version 12020)): training runs on" in sentence
+    assert severity == "warning" and f" sees no GPU (CUDA initialization: {said}): training runs on" in sentence
     assert "a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and" in sentence
 
 
