@@ -122,8 +122,7 @@ class PhotosToSplat:
         decided = ["source", "--cameras"] if begun else []
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
         decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
-        differing = [name for name in decided if begun.get(name) != asked[name]]
-        if differing:
+        if differing := [name for name in decided if begun.get(name) != asked[name]]:
             told = "; ".join(f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing)
             raise InputError(f"{folder} was begun with other settings ({told}); give another --output or delete it.")
         self._settings = begun | asked

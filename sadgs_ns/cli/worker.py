@@ -131,8 +131,7 @@ class Worker:
         with self.log.open("rb") as file:
             file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
             output = file.read().decode(errors="replace")
-        exitcode = self._process.returncode
-        if exitcode < 0:
+        if (exitcode := self._process.returncode) < 0:
             name = signal.Signals(-exitcode).name
             sentence = f"it was ended by {name}" + ", most likely for want of memory" * (name == "SIGKILL")
         raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
@@ -187,8 +186,7 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(128 + signal.SIGINT) from None
     except Exception as error:
-        sentence = sentence_of(error)
-        if sentence is None:
+        if (sentence := sentence_of(error)) is None:
             tracebacks.print_exc()
             sentence = tracebacks.format_exception_only(error)[-1].strip()
         else:

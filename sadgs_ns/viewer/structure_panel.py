@@ -60,8 +60,7 @@ def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
     """Return Markdown of the number of Gaussians, and of how structure steps, AbsGS and pruning changed it."""
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
-    steps = state.get("structure_steps", [])[-ROWS:]
-    if not steps:
+    if not (steps := state.get("structure_steps", [])[-ROWS:]):
         return "\n".join([*lines, "No structure step yet."])
     lines += ["| iteration | step | violate | low | Gaussians |", "| --- | --- | --- | --- | --- |"]
     number, last = steps[0]["before"], ""

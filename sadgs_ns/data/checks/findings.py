@@ -53,7 +53,6 @@ def and_more(where: object, count: int) -> str:
 
 def check_findings(findings: Sequence[Finding], data: Path) -> None:
     """Raise InputError with the first error among findings, if there is one, and how many more there are."""
-    errors = [finding.sentence for finding in findings if finding.severity == "error"]
-    if errors:
+    if errors := [finding.sentence for finding in findings if finding.severity == "error"]:
         more = f" (`sadgs-doctor {data}` shows {len(errors) - 1} more.)" if len(errors) > 1 else ""
         raise InputError(errors[0] + more)

@@ -215,8 +215,7 @@ def _check_distances(positions: NDArray[np.floating], views: Sequence[View], pat
         kind = fault if distance > 1e5 * spread else warning
         yield kind(f"{told}, so that all images see them from one direction: {remedy}.")
         return
-    seeing = _share_of_views_with_points(positions, views)
-    if seeing < 0.5:
+    if (seeing := _share_of_views_with_points(positions, views)) < 0.5:
         whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
         yield (warning if seeing else fault)(f"{path} has points that {whom} can see in front of it: {remedy}.")
 

@@ -46,8 +46,7 @@ def check_splits(
     for split, listed in lists.items():
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{called(split)} is no list of images' names: correct it, or remove all such lists.")
-        unknown = [name for name in listed if locate(name) not in images]
-        if unknown:
+        if unknown := [name for name in listed if locate(name) not in images]:
             which = and_more(repr(unknown[0]), len(unknown))
             raise InputError(f"{called(split)} names {which}, which is no image with a pose: correct it.")
         located[split] = set(map(locate, listed))
