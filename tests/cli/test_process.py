@@ -382,6 +382,26 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
         find_source(tmp_path, tmp_path / "out")
 
 
+@pytest.mark.hard_case(
+    "folders of photos that are links to others elsewhere, also in circles, to `/` or to each other",
+    "each photo is read once, and a scene there is none of them",
+)
+def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path):
+    photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    black(photos, "a.png", "sub/b.png")
+    black(elsewhere, "c.png", "sub/d.png", "scene/images/e.png")
+    (elsewhere / "scene" / "work").mkdir()
+    (elsewhere / "scene" / "work" / "settings.json").write_text("{}")
+    for link, target in {
+        photos / "a link": photos / "sub", photos / "day": elsewhere, photos / "sub" / "root": Path("/"),
+        elsewhere / "sub" / "circle": elsewhere, elsewhere / "back": photos / "sub", photos / "gone": tmp_path / "no",
+    }.items():  # fmt: skip
+        link.symlink_to(target)
+    names = ["a.png", "day/c.png", "day/sub/d.png", "sub/b.png"]
+    for source in (photos, Path(os.path.relpath(photos))):
+        assert find_source(source, tmp_path / "out") == (names, False, {}, [])
+
+
 @pytest.mark.hard_case("the output folder is a loop of links", "one sentence")
 def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_path: Path, capsys):
     link(tmp_path / "out")
@@ -984,6 +1004,8 @@ def test_a_folder_of_films_gives_frames_of_each(tmp_path: Path, taken: list[list
     assert taken[0] == [f"a.mkv/{i:05d}.jpg" for i in range(5)] + ["a.webm/00000.jpg", "a.webm/00001.jpg"] + [
         "day/b.webm/00000.jpg"
     ]
+    told = ["Its photos (1, such as still.png) are not used: fewer than 3."]
+    assert find_source(folder, tmp_path / "out")[3] == told
     assert "Frames of 3 videos are taken, each with a camera of its own" in capsys.readouterr().out
     record(folder / "c.webm", "libvpx", "webm", [0])
     assert main(command) == 2

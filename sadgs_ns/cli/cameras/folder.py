@@ -45,7 +45,8 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
     photos, masks, others = look_into(source, out)
     if len(photos) < 3:
         if videos := find_videos(source):
-            return videos, True, {}, others
+            unused = [f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3."] if photos else []
+            return videos, True, {}, [*unused, *others]
         told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
         raise InputError(" ".join([told, *others]))
     for name in photos:
@@ -60,9 +61,19 @@ def find_videos(folder: Path) -> list[str]:
 
 
 def _visible_files(folder: Path) -> list[str]:
-    """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them."""
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() or not path.exists()]
-    names = [path.relative_to(folder).as_posix() for path in files]
+    """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them.
+
+    Links to folders are followed, unless they lead to what is read anyway.
+    """
+    paths: list[Path] = []
+    seen = {top := Path(os.path.realpath(folder)), *top.parents}
+    for parent, folders, files in os.walk(folder, followlinks=True):
+        paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
+        real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
+        inner = {name for name in folders if Path(parent, name).is_symlink() and top in real[name].parents}
+        folders[:] = [name for name in folders if real[name] not in seen and name not in inner]
+        seen |= {real[name] for name in folders}
+    names = (path.relative_to(folder).as_posix() for path in sorted(paths))
     return [name for name in names if "/." not in f"/{name}"]
 
 
@@ -73,10 +84,11 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     in the same folder are left out.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
-    scenes = {scene, *(path.parents[1] for path in folder.glob(os.path.join("*", "**", "work", "settings.json")))}
+    files = _visible_files(folder)
+    scenes = {scene, *((folder / name).parents[1] for name in files if name.endswith("/work/settings.json"))}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
     found, stems, masks = defaultdict(list), defaultdict(list), {}
-    for name in _visible_files(folder):
+    for name in files:
         if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
             if kind == "photos" and name not in known:
                 kind = "thumbnails or trash" if _SERVICE.fullmatch(name) else "masks" if _MASK.fullmatch(name) else kind
