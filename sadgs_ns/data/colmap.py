@@ -68,8 +68,7 @@ class _Binary:
 
     def text(self) -> str:
         """Return the next string, which ends with a zero byte."""
-        end = self.content.find(b"\0", self.offset, self.offset + 4096)
-        if end < 0:
+        if (end := self.content.find(b"\0", self.offset, self.offset + 4096)) < 0:
             raise self.corrupt(f"at byte {self.offset} there is no image's name")
         raw, self.offset = self.content[self.offset : end], end + 1
         try:
@@ -89,7 +88,8 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
     for _ in range(file.take(_COUNT)[0]):
         camera_id, model_id, width, height = file.take(_CAMERA)
         if not 0 <= model_id < len(CAMERA_PARAMETERS):
-            raise file.corrupt(f"camera {camera_id} has the unknown model {model_id}")
+            problem = f"camera {camera_id} has COLMAP's model {model_id}, which nerfstudio does not know: undistort the"
+            raise InputError(f"{path}: {problem} images with `colmap image_undistorter`, or copy it again if damaged.")
         model = list(CAMERA_PARAMETERS)[model_id]
         params = file.take(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d"))
         yield camera_id, Camera(model, width, height, params)

@@ -403,6 +403,10 @@ COLMAP = {
         set_camera("OPENCV", 40, 40, 24, 18, 0, 0, 9, 0),
         r"\S+: camera 1 has p1, p2 = 9, 0, which no lens has: calibrate the camera again\.",
     ),
+    "poses-twice": (
+        model(lambda cameras, images, points: images.update({1: images[1]._replace(name="001.png")})),
+        r"\S+/images\.bin has more than one pose of \S+/images/001\.png: keep one, or give each an image of its own\.",
+    ),
     "poses-shifted": (
         move_cameras(lambda centres: centres + 1e7),
         r"\S+/images\.bin has its cameras 1\.73e\+07 units from the origin and only \S+ apart, which float32 cannot .*",
@@ -428,7 +432,7 @@ COLMAP = {
     "cameras-empty": (overwrite(f"{SPARSE}/cameras.bin", ""), r"\S+/cameras\.bin is cut off or corrupt \(.*"),
     "cameras-corrupt": (
         patch(f"{SPARSE}/cameras.bin", 12, "<i", 99),
-        r"\S+/cameras\.bin is cut off or corrupt \(camera 1 has the unknown model 99\): copy it again, or .*\.",
+        r"\S+/cameras\.bin: camera 1 has COLMAP's model 99, which nerfstudio does not know: undistort the images .*\.",
     ),
     "images-missing": (remove(f"{SPARSE}/images.bin"), r"\S+/images\.bin cannot be read \(No such file.*"),
     "images-truncated": (cut(f"{SPARSE}/images.bin", 0.5), r"\S+/images\.bin is cut off or corrupt \(.*"),
@@ -479,6 +483,10 @@ NERFSTUDIO = {
     "json-short-pose": (
         meta(lambda m: m["frames"][2].update(transform_matrix=[[1, 0, 0, 0]])),
         r"\S+: frame images/002\.png has no pose of 4 × 4 numbers: .*\.",
+    ),
+    "json-image-twice": (
+        meta(lambda m: m["frames"].append(dict(m["frames"][3], file_path="./images/003.png"))),
+        r"\S+/transforms\.json has more than one pose of \S+/images/003\.png: keep one, or give each an image of .*\.",
     ),
     "json-no-focal": (meta(lambda m: m["frames"][1].pop("fl_x")), r"\S+: frame images/001\.png has no fl_x: .*"),
     "json-camera-model": (meta(lambda m: m.update(camera_model="LENS")), r"\S+ has the camera model 'LENS'.*"),
@@ -812,8 +820,8 @@ CASES = {
     "one point 10⁵ to 10²⁰⁰ units away, in `sadgs-doctor`", "a note", "point-wild", "point-beyond-bounds"
 )
 @pytest.mark.hard_case(
-    "a corrupt COLMAP binary: cut off, empty, an unknown model, a count of 2⁶⁰",
-    "refused: where it ends",
+    "a corrupt COLMAP binary: cut off, empty, an unknown camera model, a count of 2⁶⁰",
+    "refused: where it ends; models that are newer than nerfstudio are not called corrupt",
     "cameras-truncated",
     "cameras-empty",
     "cameras-corrupt",
@@ -893,6 +901,12 @@ CASES = {
 )
 @pytest.mark.hard_case("fx and fy that differ by more than 2 times", "a warning", "camera-stretched")
 @pytest.mark.hard_case("an image 1 px wide", "refused", "image-line")
+@pytest.mark.hard_case(
+    "an image with two poses",
+    "refused: keep one; it counted twice, and a held-out view was trained on",
+    "json-image-twice",
+    "poses-twice",
+)
 @pytest.mark.hard_case(
     "EXIF orientation 6, and poses of the upright images", "refused by that tag", "image-orientation"
 )

@@ -109,6 +109,10 @@ def with_other_names(change: Callable[[str], str]) -> Callable[[dict[str, Any]],
         "an angle alone": (lambda m: m.update(camera_angle_x=ANGLES["camera_angle_x"]), without(*PINHOLE)),
         "two angles and sizes": (lambda m: m.update(ANGLES, w=WIDTH, h=HEIGHT), without(*PINHOLE)),
         "an angle in each frame": (dict, lambda f: [without(*PINHOLE)(f), f.update(ANGLES)]),
+        "an angle in each frame beside the file's focal length": (
+            lambda m: m.update(fl_x=9.0, fl_y=5.0),
+            lambda f: [without("fl_x", "fl_y")(f), f.update(camera_angle_x=ANGLES["camera_angle_x"])],
+        ),
         "one focal length": (dict, without("fl_y", "cx", "cy", "w", "h")),
         "names without suffix": (dict, with_other_names(lambda name: name.removesuffix(".png"))),
         "backslashes": (dict, with_other_names(lambda name: name.replace("/", "\\"))),
@@ -160,15 +164,17 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
 
 
 @pytest.mark.hard_case(
-    "an image that is there with another suffix, or in another folder than a `transforms.json` or a Blender scene says",
+    "an image that is there with another suffix, in other case, or in another folder than a `transforms.json` (also of "
+    "Windows) or a Blender scene says",
     "refused: the sentence names the file that is there",
 )
-@pytest.mark.parametrize("name", ["images/000.jpg", "/home/someone/scene/000.jpg", "000.png"])
+@pytest.mark.parametrize("name", ["images/a.jpg", "/home/me/scene/a.jpg", "A.png", r"C:\scene\images\A.png"])
 def test_an_image_elsewhere_is_named(name: str, write: Callable[..., Path]):
     data = write(lambda m: m["frames"][0].update(file_path=name))
+    (data / "images/000.png").rename(data / "images/A.png")
     (said,) = errors(data)
     assert said == (
-        f"{data / name} does not exist, but {data / 'images/000.png'} does: correct the name, or save that as this."
+        f"{data / name} does not exist, but {data / 'images/A.png'} does: correct the name, or save that as this."
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Literal
 
 import numpy as np
@@ -109,6 +109,9 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     for same in problems.values():
         path, text = same[0]
         yield fault(f"{and_more(path, len(same))} {text}.")
+    if twice := [image for image, poses in Counter(frame.image for frame in frames).items() if poses > 1]:
+        told = f"{source} has more than one pose of {and_more(twice[0], len(twice))}"
+        yield fault(f"{told}: keep one, or give each an image of its own.")
     if look_for_unused and (unused := _unused_images(frames)):
         where = and_more(unused[0], len(unused))
         yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
@@ -120,8 +123,7 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     if all(frame.mask is not None and _is_flat(frame.mask, black=True) for frame in frames):
         told = f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}"
         yield fault(f"{told}, which leaves no pixel to train on: make white what is to be trained on.")
-    lying = [frame.image for frame, image in zip(frames, images, strict=True) if _may_lie(image)]
-    if lying:
+    if lying := [frame.image for frame, image in zip(frames, images, strict=True) if _may_lie(image)]:
         told = f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it"
         remedy = f"if the poses are those of the turned images, {_TURN}"
         yield warning(f"{told}, which training ignores, as COLMAP does: {remedy}.")
@@ -137,7 +139,8 @@ def _problem(frame: Frame, image: _Image, mask: _Image | None, source: Path) -> 
     """Return the problem of a frame's files, or None: its kind, the file and the rest of the sentence."""
     if image.problem.startswith("does not exist"):
         places = (frame.image.parent, source.parent / "images", source.parent)
-        if near := [path for place in places for path in images_in(place) if path.stem == frame.image.stem]:
+        stem = PureWindowsPath(str(frame.image)).stem.lower()  # Windows' paths and names in other case occur.
+        if near := [path for place in places for path in images_in(place) if path.stem.lower() == stem]:
             return "near", frame.image, f"does not exist, but {near[0]} does: correct the name, or save that as this"
     if image.problem:
         return image.problem.split(" (")[0], frame.image, image.problem
@@ -221,12 +224,12 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
         with path.open("rb") as file:
             file.seek(-2, 2)
             return file.read() == b"\xff\xd9"
-    if image.format == "PNG":
-        try:
+    with suppress(
+        Exception
+    ):  # It raises anything, also for a file that lacks its last bytes alone, which decodes well.
+        if image.format == "PNG":
             image.verify()  # This reads its checksums.
-        except Exception:  # It raises anything, also for a file that lacks its last bytes alone, which decodes well.
-            return False
-        return True
+            return True
     return False
 
 

@@ -130,7 +130,9 @@ def read_transforms(path: Path) -> dict[str, Any]:
 
 def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[str, Any]:
     """Return the frame's intrinsics, derived from shared values, angles or the image, and its image's mended name."""
-    where, values, name = f"{path}: frame {frame['file_path']}", {**meta, **frame}, frame["file_path"]
+    where, name = f"{path}: frame {frame['file_path']}", frame["file_path"]
+    has_focal = not frame.keys().isdisjoint(("fl_x", "camera_angle_x"))  # Then no shared one is of this frame.
+    values = {n: meta[n] for n in meta if not (has_focal and n.startswith(("fl_", "camera_angle_")))} | frame
     names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
     name = next((found for found in names if (path.parent / found).is_file()), name)
     if not values.keys() >= {"w", "h"} and any(size := image_size(path.parent / name)):
