@@ -561,8 +561,8 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
 
 @pytest.mark.hard_case(
     "in the photos' folder: thumbnails and trash of a NAS (`@eaDir`, `#recycle`), `__MACOSX`, `images_2`, `images_4`, "
-    "copies such as `a (1).jpg`, the same photo as WebP, an iPhone's edited `IMG_E1.jpg`, a mask of no photo, an "
-    "earlier scene",
+    "copies such as `a (1).jpg`, the same photo as WebP, an iPhone's edited `IMG_E1.jpg`, a mask of no photo, depth "
+    "and confidence maps as scanners of phones keep them, an earlier scene",
     "left out, with a line; photos of a rig's cameras, which have equal names, are not",
 )
 def test_what_is_no_photo_becomes_none(tmp_path: Path):
@@ -577,7 +577,8 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
         "images/b.webp": views[1], "images/IMG_E1.jpg": views[2].point(lambda value: 0.7 * value + 50),
         "@eaDir/a.jpg/SYNOFILE_THUMB_M.jpg": views[0].resize((80, 60)), "#recycle/old.jpg": views[0].rotate(9),
         "__MACOSX/x.jpg": views[0].rotate(20), "masks/none.png": Image.new("L", (WIDTH, HEIGHT)),
-        "images/a_mask.png": Image.new("L", (WIDTH, HEIGHT), 255),
+        "images/a_mask.png": Image.new("L", (WIDTH, HEIGHT), 255), "depth/a.png": Image.new("I;16", (WIDTH, HEIGHT), 9),
+        "images/b.depth.png": Image.new("I;16", (WIDTH, HEIGHT), 8), "Confidence/b.png": Image.new("L", (WIDTH, 9), 7),
     }  # fmt: skip
     for name, image in (files | left).items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -590,6 +591,7 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     assert found == sorted(files) and masks == {"images/a.jpg": "images/a_mask.png"}
     assert told == [
         "Left out as thumbnails or trash: 3, such as #recycle/old.jpg.",
+        "Left out as depth or other maps: 3, such as Confidence/b.png.",
         "Left out as copies of others: 5, such as images/a (1).jpg.",
         "Left out as masks of no photo: 1, such as masks/none.png.",
     ]
@@ -1027,6 +1029,7 @@ def test_films_beside_photos_are_told_of(tmp_path: Path, registered: Callable[[i
 def test_poses_of_other_programs_are_told_of(tmp_path: Path, registered: Callable[[int], None], capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     (photos / "poses.csv").write_text("#name,x,y,alt\n")
+    (photos / "others.csv").mkdir()
     registered(9)
     assert main([str(photos), str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.startswith(f"Poses are computed anew. {photos}/poses.csv has poses: `ns-")

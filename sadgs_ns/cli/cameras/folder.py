@@ -27,6 +27,7 @@ _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw"
 """Suffixes of formats that are not read. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
+_MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
 _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\(\d+\))$")
 """Additions to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
@@ -91,7 +92,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     for name in files:
         if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
             if kind == "photos" and name not in known:
-                kind = "thumbnails or trash" if _SERVICE.fullmatch(name) else "masks" if _MASK.fullmatch(name) else kind
+                others = {"thumbnails or trash": _SERVICE, "depth or other maps": _MAP, "masks": _MASK}
+                kind = next((other for other, names in others.items() if names.fullmatch(name)), kind)
             found[kind].append(name)
     maps = [name for name in found["masks"] if _is_mask(folder / name)]
     photos = sorted({*found["photos"], *found["masks"]} - {*maps})

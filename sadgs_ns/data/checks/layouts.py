@@ -103,7 +103,7 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
 def poses_elsewhere(data: Path) -> str | None:
     """Return the sentence for a folder with another program's poses, which `ns-process-data` reads, or None."""
     for pattern, (mark, options) in _EXPORTS.items():
-        if files := [file for file in sorted(data.glob(pattern)) if mark in file.read_bytes()]:
+        if files := [file for file in sorted(data.glob(pattern)) if file.is_file() and mark in file.read_bytes()]:
             photos = next((folder for folder in (data, *sorted(data.glob("*/"))) if images_in(folder)), data)
             named = {"file": files[0], "photos": photos, "data": data}
             command = options.format(**{name: shlex.quote(str(path)) for name, path in named.items()})
