@@ -286,8 +286,9 @@ class PhotosToSplat:
             nonlocal total, count
             if event == "training begins":
                 total = f"{fields['iterations']:,}"
-            elif event == "on the CPU":
-                line.print(fields["told"])
+            elif event == "warning":
+                words = "end the command with `" + "-- " * (not self.train_options)
+                line.print(fields["told"].replace("end the command with `", words))
             elif event == "iteration":
                 # Meanwhile it imports what export needs.
                 self._exporter = self._exporter or self.worker("export", _EXPORT)

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
-from sadgs_ns.events import report
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.memory_plan import fit_to_memory, training_size
@@ -123,9 +122,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
         told = f"pipeline.views_per_iteration is {requested}, but there are {views} training views"
         warn(f"{told}: all are taken each time.")
     if pipeline.device.type == "cpu":
-        told = cpu_notice(torch.get_num_threads())
-        warn(told)
-        report("on the CPU", told=told)
+        warn(cpu_notice(torch.get_num_threads()))
 
 
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:

@@ -33,7 +33,9 @@ def note(text: str) -> None:
 
 
 def warn(text: str) -> None:
-    """Print a line in yellow."""
+    """Print a line in yellow, which `sadgs` shows, too."""
+    if not CONSOLE.quiet:  # as it is in other processes than the first
+        report("warning", told=text)
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True, style="yellow")
 
 

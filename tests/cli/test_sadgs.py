@@ -374,6 +374,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             Path(command[2]).mkdir()
             (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
+        on_event("warning", told="masks are not used: end the command with `colmap` to use them.")
         on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
         (work._run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
@@ -428,7 +429,8 @@ def test_the_process_that_exports_starts_while_training_runs(
 
 @pytest.mark.hard_case(
     "`sadgs FOLDER` where the folder brings a COLMAP model, or one among its images, or `transforms.json`, or is one",
-    "its cameras are used and named; `--cameras new` finds others; nothing is written there",
+    "its cameras are used and named; `--cameras new` finds others; nothing is written there; warnings of it, such as "
+    "that of masks that are not used, are printed",
 )
 @pytest.mark.parametrize("layout", ["sparse/0", "beside", "transforms.json", "file"])
 def test_cameras_that_a_folder_brings_are_used(
@@ -451,8 +453,9 @@ def test_cameras_that_a_folder_brings_are_used(
     before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
     command = [str(given), "-o", str(tmp_path / "out"), "--formats", "ply"]
     assert main(command) == 0
-    cameras = f"those of {source / used}; --cameras new finds others"
-    assert lines_of(capsys.readouterr().out)["cameras"] == cameras
+    cameras, printed = f"those of {source / used}; --cameras new finds others", capsys.readouterr().out
+    assert lines_of(printed)["cameras"] == cameras
+    assert "\nmasks are not used: end the command with `-- colmap` to use them.\n" in printed
     assert [words[0] for words in commands] == ["ns-train", "sadgs-export"]
     assert {words[words.index("--data") + 1] for words in commands} == {str(given)}
     assert main(command) == 0
