@@ -141,8 +141,7 @@ class StructureAwareStrategy(Strategy):
     def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
         """Check as gsplat's strategies do, and raise ValueError if a parameter that the method needs is missing."""
         super().check_sanity(params, optimizers)  # type: ignore[arg-type]
-        missing = {"means", "scales", "quats", "opacities"} - set(params)
-        if missing:
+        if missing := {"means", "scales", "quats", "opacities"} - set(params):
             raise ValueError(f"params lack {sorted(missing)}: StructureAwareStrategy needs them by these names")
 
     def observes(self, step: int) -> bool:

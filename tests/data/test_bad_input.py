@@ -622,6 +622,10 @@ NERFSTUDIO = {
         meta(lambda m: m.update(fisheye_crop_radius="wide")),
         r"\S+ has fisheye_crop_radius = 'wide', which is no finite number: correct it\.",
     ),
+    "json-null-depth": (
+        meta(lambda m: [frame.update(depth_file_path=None) for frame in m["frames"]]),
+        r"\S+: frame 0 has a depth_file_path that no file can have: correct or remove it\.",
+    ),
     "json-zero-byte": (
         meta(lambda m: m["frames"][1].update(mask_path="a\0b")),
         r"\S+: frame 1 has a mask_path that no file can have: correct or remove it\.",
@@ -922,7 +926,9 @@ CASES = {
 @pytest.mark.hard_case("depths for some frames", "refused: all or none", "json-some-depths")
 @pytest.mark.hard_case("`distortion_params` that is no list of 6 numbers", "refused", "json-few-coefficients")
 @pytest.mark.hard_case("a pose whose last row is 0 0 0 2 (nerfstudio ignores it)", "refused", "json-last-row")
-@pytest.mark.hard_case("a zero byte in a file's name", "refused", "json-zero-byte")
+@pytest.mark.hard_case(
+    "a zero byte in a file's name; null in its place", "refused", "json-zero-byte", "json-null-depth"
+)
 @pytest.mark.hard_case("a name with a space in COLMAP's text", "refused: write the model in binary", "text-space")
 @pytest.mark.parametrize("case", CASES)
 def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
@@ -1029,6 +1035,11 @@ UNLIKELY = {
         "warning",
         r"\S+/masks holds masks that are not used: end the command with `colmap --colmap-path sparse/0 --masks-path .*",
     ),
+    "camera-shares": (
+        set_camera("PINHOLE", 40, 40, 0.5, 0.5),
+        "warning",
+        r"\S+: camera 1 has its principal point at \(0\.5, 0\.5\) px, in a corner of its image of 48 × 36 px: .*\.",
+    ),
     "camera-stretched": (
         set_camera("PINHOLE", 40, 100, 24, 18),
         "warning",
@@ -1063,7 +1074,8 @@ UNLIKELY = {
 
 
 @pytest.mark.hard_case(
-    "one camera more than 30 times as far out as 90 % of them; a principal point just outside the image; "
+    "one camera more than 30 times as far out as 90 % of them; a principal point just outside the image, or given "
+    "as shares of it or as 0; "
     "distortion that cannot be undone in the corners alone; points more than 10³ times as far away as the "
     "cameras are apart",
     "trains, with a warning",

@@ -131,8 +131,9 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
     width, height = camera.width, camera.height
     off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
-    if off > 0.5:
-        center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, outside its image of {width} × {height} px"
+    if off > 0.5 or max(camera.cx, camera.cy) <= 1:  # The latter are shares of the image, or were not known.
+        place = f"{'outside' if off > 0.5 else 'in a corner of'} its image of {width} × {height} px"
+        center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, {place}"
         yield (fault if off > _FARTHEST_CENTER else warning)(f"{where} has {center}: correct cx and cy, in pixels.")
     half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
     angle = 2 * math.degrees(math.atan(max(half_width, half_height)))

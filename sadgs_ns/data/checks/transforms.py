@@ -220,7 +220,7 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
             raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
-        for name in ("file_path", "mask_path"):
+        for name in ("file_path", "mask_path", "depth_file_path"):
             if not isinstance(value := frame.get(name, ""), str) or "\0" in value:
                 raise InputError(f"{path}: frame {number} has a {name} that no file can have: correct or remove it.")
     return frames
