@@ -1108,13 +1108,17 @@ def test_a_frame_that_could_not_be_written_is_told_and_made_again(tmp_path: Path
     assert main(command) == 130 and len(taken[0]) == 6
 
 
-def test_another_number_of_frames_is_another_scene(tmp_path: Path, taken: list[list[str]], capsys):
+@pytest.mark.hard_case("a video that was replaced by another of its name", "refused, as a photo is")
+def test_another_number_of_frames_or_another_film_is_another_scene(tmp_path: Path, taken: list[list[str]], capsys):
     command = [str(film(tmp_path / "film.avi", 8)), str(tmp_path / "out"), "--frames"]
     assert main([*command, "4"]) == 130 and len(taken[0]) == 4
     assert main([*command, "8"]) == 2 and len(taken) == 1
     printed = capsys.readouterr().err
     assert "with other photos or settings (--frames was 4, is 8); give another folder or delete it." in printed
     assert main([*command, "4"]) == 130 and taken[0] == taken[1]
+    film(tmp_path / "film.avi", 9)
+    assert main([*command, "4"]) == 2 and len(taken) == 2
+    assert "settings (videos changed: 1, such as film.avi); put these videos back, give" in capsys.readouterr().err
 
 
 def test_photos_added_or_removed_while_it_is_not_finished_make_another_scene(

@@ -102,10 +102,11 @@ class _Scene:
     def _check_unchanged(self) -> None:
         asked: dict[str, Any] = self.settings | ({"max_size": self.options.max_size} if self.finished else {})
         told, back, kind, names = [], "", "videos" if self.is_video else "photos", ["source"]
+        source = self.options.source
         if self.begun.get("source") == asked["source"]:  # With another source all the rest differs, too.
             before, now = {*self.begun.get("photos", [])}, {*asked["photos"]}
             changes = {
-                "changed": changed_photos(self.options.source, self.begun.get("files", {})),
+                "changed": {name or source.name for name in changed_photos(source, self.begun.get("files", {}))},
                 "added": set() if self.finished and not self.is_video else now - before,
                 "removed": before - now,
             }
@@ -151,8 +152,7 @@ def process(options: Process) -> Summary:
     RunError if COLMAP fails, and Interrupted if a signal came: the work so far is kept.
     """
     with Interrupts(waiting=lambda: True):
-        scene = _Scene(options)
-        if scene.finished and not scene.added:
+        if (scene := _Scene(options)).finished and not scene.added:
             scene.remove_intermediate_files()
             _say("unchanged", f"{options.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
@@ -177,10 +177,11 @@ def _make(scene: _Scene, report: Report) -> Summary:
     with contextlib.ExitStack() as alone, start_colmap() as colmap:
         folder, names = options.source, scene.settings["photos"]
         if scene.is_video:
-            folder = work / "frames"
             if names:
                 _say("videos", f"Frames of {len(names)} videos are taken, each with a camera of its own.")
+            folder = work / "frames"
             chosen = [] if folder.exists() else video_frames(options.source, names, options.frames)
+            scene.settings["files"] = scene.begun.get("files") or photo_stamps(options.source, names or [""])
             alone.enter_context(scene.alone())  # It notes the settings, by which an interrupted run goes on.
             if not folder.exists():
                 partial = empty_folder(work / "frames.partial")

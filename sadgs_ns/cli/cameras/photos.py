@@ -49,11 +49,12 @@ class Photo:
 
 
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    """Return size in bytes, time of the last change in ns and checksum of each photo."""
+    """Return size in bytes, time of the last change in ns and checksum of the beginning of each photo or video."""
 
     def stamp(name: str) -> list[int]:
         status = (folder / name).stat()
-        return [status.st_size, status.st_mtime_ns, zlib.crc32((folder / name).read_bytes())]
+        with (folder / name).open("rb") as file:
+            return [status.st_size, status.st_mtime_ns, zlib.crc32(file.read(1 << 26))]
 
     with threads() as pool:
         return dict(zip(names, pool.map(stamp, names), strict=True))
