@@ -117,8 +117,7 @@ class Worker:
                 *lines, rest = (rest + file.read()).split(b"\n")
                 for line in lines:
                     fields = json.loads(line)
-                    event = fields.pop("event")
-                    if event == "result":
+                    if (event := fields.pop("event")) == "result":
                         if self._saves:  # Its threads may be writing.
                             self._process.wait()
                         return fields["value"]

@@ -386,7 +386,8 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     "folders of photos that are links to others elsewhere, also in circles, to `/` or to each other",
     "each photo is read once, and a scene there is none of them",
 )
-def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path):
+@pytest.mark.hard_case("a folder among the photos that may not be entered", "left out, with a line")
+def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
     black(photos, "a.png", "sub/b.png")
     black(elsewhere, "c.png", "sub/d.png", "scene/images/e.png")
@@ -397,9 +398,19 @@ def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path):
         elsewhere / "sub" / "circle": elsewhere, elsewhere / "back": photos / "sub", photos / "gone": tmp_path / "no",
     }.items():  # fmt: skip
         link.symlink_to(target)
+    (photos / "locked").mkdir()
+    scandir = os.scandir
+
+    def without_rights(folder: str) -> Any:
+        if os.path.basename(folder) == "locked":
+            raise PermissionError(errno.EACCES, "Permission denied", folder)
+        return scandir(folder)
+
+    monkeypatch.setattr(os, "scandir", without_rights)
     names = ["a.png", "day/c.png", "day/sub/d.png", "sub/b.png"]
+    left_out = ["Left out as folders that cannot be read: 1, such as locked."]
     for source in (photos, Path(os.path.relpath(photos))):
-        assert find_source(source, tmp_path / "out") == (names, False, {}, [])
+        assert find_source(source, tmp_path / "out") == (names, False, {}, left_out)
 
 
 @pytest.mark.hard_case("the output folder is a loop of links", "one sentence")

@@ -64,16 +64,17 @@ def find_videos(folder: Path) -> list[str]:
 def _visible_files(folder: Path) -> list[str]:
     """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them.
 
-    Links to folders are followed, unless they lead to what is read anyway.
+    Folders that cannot be read are among them. Links to folders are followed, unless they lead to what is read anyway.
     """
-    paths: list[Path] = []
+    paths, unread = list[Path](), list[OSError]()
     seen = {top := Path(os.path.realpath(folder)), *top.parents}
-    for parent, folders, files in os.walk(folder, followlinks=True):
+    for parent, folders, files in os.walk(folder, onerror=unread.append, followlinks=True):
         paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
         real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
         inner = {name for name in folders if Path(parent, name).is_symlink() and top in real[name].parents}
         folders[:] = [name for name in folders if real[name] not in seen and name not in inner]
         seen |= {real[name] for name in folders}
+    paths += (Path(error.filename) for error in unread)
     names = (path.relative_to(folder).as_posix() for path in sorted(paths))
     return [name for name in names if "/." not in f"/{name}"]
 
@@ -115,6 +116,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
 def _kind(path: Path) -> str:
     """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
     suffix, kind, start = path.suffix.lower(), "", b""
+    if path.is_dir():
+        return "folders that cannot be read"
     with contextlib.suppress(OSError), path.open("rb") as file:  # What cannot be read is named later.
         start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
