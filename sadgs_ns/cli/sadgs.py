@@ -24,7 +24,7 @@ import tyro
 from rich.console import Console
 
 from sadgs_ns.cli.cameras.command import Process, check_size, photos_added
-from sadgs_ns.cli.cameras.folder import find_source
+from sadgs_ns.cli.cameras.folder import find_source, image_checksum
 from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
@@ -115,13 +115,15 @@ class PhotosToSplat:
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}
         if self._camera_file:
             asked["--cameras"] = f"{self._camera_file} (checksum {zlib.crc32(self._camera_file.read_bytes()):08x})"
+            asked["images"] = image_checksum(self.source if self.source.is_dir() else self.source.parent)
         asked |= {"--effort": options.effort, "options of ns-train": list(self.train_options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
             raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
         decided = ["source", "--cameras"] if begun else []
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
-        decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
+        trained = [name for name in ("images", "--effort", "options of ns-train") if name in asked]
+        decided += trained if self._checkpoint() else []
         if differing := [name for name in decided if begun.get(name) != asked[name]]:
             told = "; ".join(f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing)
             raise InputError(f"{folder} was begun with other settings ({told}); give another --output or delete it.")

@@ -35,8 +35,7 @@ def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
     """Tell whether steps of so many views have too few pixels for several devices, and print so."""
-    pixels = views * _pixels(cameras)
-    if pixels >= LEAST_PIXELS * devices:
+    if (pixels := views * _pixels(cameras)) >= LEAST_PIXELS * devices:
         return False
     note(
         f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "

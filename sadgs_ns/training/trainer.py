@@ -275,8 +275,7 @@ class SadgsTrainer(Trainer):
         """Save a checkpoint, and name it in `config.yml`; return if the run was done, else raise SystemExit."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
-        done = self._completed_step + 1
-        if done >= total:
+        if (done := self._completed_step + 1) >= total:
             return
         if done == self._start_step:
             text = f"{interrupted}: {_NOTHING_DONE}"

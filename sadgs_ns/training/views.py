@@ -121,8 +121,7 @@ class TrainingViews:
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""
-        world = self.model.world
-        if not world.alone:
+        if not (world := self.model.world).alone:
             sizes = tuple(self.sizes[index] for index in indices)
             indices = [indices[position] for position in views_of_rank(sizes, world.num_ranks, world.rank)]
         return list(dict.fromkeys(indices))
@@ -148,8 +147,7 @@ class TrainingViews:
     def viewmat(self, index: int) -> Tensor:
         """World-to-camera matrix of a training view, corrected by the camera optimizer. [4, 4]"""
         viewmats, _ = self.cameras
-        optimizer = self.model.camera_optimizer
-        if optimizer.config.mode == "off":
+        if (optimizer := self.model.camera_optimizer).config.mode == "off":
             return viewmats[index]
         camera = self.datamanager.train_cameras[index : index + 1].to(self.model.device)
         camera.metadata = {"cam_idx": index}

@@ -430,7 +430,7 @@ def test_the_process_that_exports_starts_while_training_runs(
 @pytest.mark.hard_case(
     "`sadgs FOLDER` where the folder brings a COLMAP model, or one among its images, or `transforms.json`, or is one",
     "its cameras are used and named; `--cameras new` finds others; nothing is written there; warnings of it, such as "
-    "that of masks that are not used, are printed",
+    "that of masks that are not used, are printed; other images there are another run",
 )
 @pytest.mark.parametrize("layout", ["sparse/0", "beside", "transforms.json", "file"])
 def test_cameras_that_a_folder_brings_are_used(
@@ -467,6 +467,12 @@ def test_cameras_that_a_folder_brings_are_used(
         f"--max-size is for new cameras, and those of {source / used} are used: leave it out, or for"
         in capsys.readouterr().err
     )
+    extra = source / "images" / "mask.png"
+    extra.write_bytes(b"another image")
+    assert main(command) == 2
+    said = re.escape(f"{tmp_path}/out was begun with other settings (images was ") + r"\d+ \(checksum \w+\), is \d+ \(c"
+    assert re.search(said, capsys.readouterr().err)
+    extra.unlink()
     (source / used).write_bytes((source / used).read_bytes() + b" ")
     assert main(command) == 2
     assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err

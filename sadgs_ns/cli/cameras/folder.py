@@ -7,6 +7,7 @@ import filecmp
 import math
 import os
 import re
+import zlib
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -77,6 +78,13 @@ def _visible_files(folder: Path) -> list[str]:
     paths += (Path(error.filename) for error in unread)
     names = (path.relative_to(folder).as_posix() for path in sorted(paths))
     return [name for name in names if "/." not in f"/{name}"]
+
+
+def image_checksum(folder: Path) -> str:
+    """Return the number of a folder's images, with a checksum of their names and sizes in bytes."""
+    images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+    sizes = ((folder / name).stat().st_size if (folder / name).exists() else 0 for name in images)
+    return f"{len(images)} (checksum {zlib.crc32(repr([*zip(images, sizes, strict=True)]).encode()):08x})"
 
 
 def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
