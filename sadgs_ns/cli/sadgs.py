@@ -86,7 +86,7 @@ class PhotosToSplat:
         self.source, self.folder = options.source, options.output or Path(name)
         self.options, self.train_options, self.console = options, train_options, console
         self._formats = sorted(_formats(options.formats, console), key=lambda name: name == "html")
-        self._camera_file = _cameras_of(options)
+        self._camera_file = _cameras_of(options, train_options)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
         self._settings: dict[str, Any] = {}
@@ -289,8 +289,7 @@ class PhotosToSplat:
             if event == "training begins":
                 total = f"{fields['iterations']:,}"
             elif event == "warning":
-                words = "end the command with `" + "-- " * (not self.train_options)
-                line.print(fields["told"].replace("end the command with `", words))
+                line.print(_dashed(fields["told"], self.train_options))
             elif event == "iteration":
                 # Meanwhile it imports what export needs.
                 self._exporter = self._exporter or self.worker("export", _EXPORT)
@@ -354,14 +353,22 @@ STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {
 before, updates its line, and returns the line's last sentence. It may raise InputError and RunError."""
 
 
-def _cameras_of(options: Sadgs) -> Path | None:
+def _dashed(sentence: str, train_options: Sequence[str]) -> str:
+    """Return a sentence on the end of a command of `ns-train` as it is for this one."""
+    return sentence.replace("end the command with `", "end the command with `" + "-- " * (not train_options))
+
+
+def _cameras_of(options: Sadgs, train_options: Sequence[str]) -> Path | None:
     """Return the file of the source's cameras, or None; raise InputError if they cannot be trained on."""
     try:
         if options.cameras == "new" or (file := find_cameras(options.source)) is None:
             return None
-        check_findings(check_data(options.source), options.source)
+        # Training checks what a parser reads that is named.
+        if {"colmap", "nerfstudio-data", "blender-data"}.isdisjoint(train_options):
+            check_findings(check_data(options.source), options.source)
     except InputError as error:
-        raise InputError(f"{str(error).rstrip('.')}; or find new cameras with --cameras new.") from None
+        told = _dashed(str(error).rstrip("."), train_options)
+        raise InputError(f"{told}; or find new cameras with --cameras new.") from None
     if options.max_size != Sadgs.max_size:
         smaller = "or for images of half the size `-- --pipeline.datamanager.camera-res-scale-factor 0.5` at the end"
         raise InputError(f"--max-size is for new cameras, and those of {file} are used: leave it out, {smaller}.")

@@ -82,8 +82,7 @@ def plan_run(
     clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
-    windows = planned.windows
-    if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
+    if (windows := planned.windows).refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
         warn(
             f"{length.iterations} iterations are too few for a structure-aware split: densification ends at "
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "

@@ -88,8 +88,7 @@ class TrainingViews:
     @cached_property
     def prefetcher(self) -> ImagePrefetcher | None:
         """Brings images from the host ahead of their step; None if all images are on the device."""
-        config = self.datamanager.config
-        if config.cache_images == "gpu":
+        if (config := self.datamanager.config).cache_images == "gpu":
             return None
         threads = thread_count(config.max_thread_workers)
         return ImagePrefetcher(self.datamanager.cached_train, self.model.device, threads)

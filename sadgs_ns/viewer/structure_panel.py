@@ -196,8 +196,7 @@ class StructurePanel(torch.nn.Module):
         `picture` does not do so, because the viewer aborts drawing at any line when its camera moves, and photos that
         are undistorted twice would be wrong.
         """
-        chosen = self.choice.value
-        if chosen in OF_STATISTICS and self.statistics() is None:
+        if (chosen := self.choice.value) in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
         elif chosen in OF_PHOTOS:
             self._read_photos()

@@ -486,6 +486,23 @@ def test_cameras_that_a_folder_brings_are_used(
 
 
 @pytest.mark.hard_case(
+    "`sadgs FOLDER` with a reconstruction that ns-train's options can make good, such as one without points",
+    "the sentence has these options, and with them it trains",
+)
+def test_options_that_name_a_parser_are_taken_at_their_word(
+    scene: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    source = Path(shutil.copytree(scene, tmp_path / "capture"))
+    for file in source.glob("sparse/0/points3D.*"):
+        file.unlink()
+    command = [str(source), "-o", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 2
+    (words,) = re.findall("end the command with `(-- colmap [^`]*)`", capsys.readouterr().err)
+    assert main([*command, *words.split()]) == 0
+    assert commands[0][0] == "ns-train" and commands[0][-2:] == ["--load-3D-points", "False"]
+
+
+@pytest.mark.hard_case(
     "`sadgs CAPTURE/images` where the capture has cameras",
     "finds new ones, and a line tells of those and how to use them",
 )
