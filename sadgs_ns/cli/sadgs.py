@@ -23,8 +23,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from sadgs_ns.cli.cameras.command import Process, check_size, photos_added
-from sadgs_ns.cli.cameras.folder import find_source, image_checksum
+from sadgs_ns.cli.cameras.command import Process, Scene, check_size
+from sadgs_ns.cli.cameras.folder import image_checksum
 from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
@@ -103,8 +103,10 @@ class PhotosToSplat:
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
-        if not self._camera_file:
-            count_frames(self.source) if self.source.is_file() else find_source(self.source, self._scene)
+        if self.source.is_file() and not self._camera_file:
+            count_frames(self.source)
+        self._process = Process(self.source, self._scene, max_size=options.max_size)
+        self._added = 0 if self._camera_file else Scene(self._process).added
 
     def _read_settings(self) -> None:
         """Read the settings that the folder was begun with, and replace those that nothing depends on yet.
@@ -150,9 +152,11 @@ class PhotosToSplat:
         refusal = f"another sadgs works in {self.folder}; wait for it, or stop it."
         with locked(self.folder, refusal, _LOCK_SECONDS) as self._lock, contextlib.ExitStack() as self._workers:
             self._read_settings()  # Another run may have gone on meanwhile.
+            if "views" in self._settings and not (self._scene / "transforms.json").exists():  # Somebody deleted it.
+                self._settings |= {"views": None, "trained": None, "run": f"run-{int(time.time())}"}
             self._note()
             # Meanwhile it imports what training needs.
-            needs_training = not self._trained() or (not self._camera_file and photos_added(self.source, self._scene))
+            needs_training = not self._trained() or self._added
             self._trainer = self.worker("training", _TRAINING) if needs_training else None
             for name, stage in STAGES.items():
                 self.timeline.begin(*_FIRST_PARTS.get(name, (name, name)))
@@ -235,8 +239,7 @@ class PhotosToSplat:
         with contextlib.suppress(InputError):  # It is about another folder.
             if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
                 line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
-        few = self._settings.get("few")
-        if few and (self.options.anyway or self._checkpoint()) and not photos_added(self.source, self._scene):
+        if (few := self._settings.get("few")) and (self.options.anyway or self._checkpoint()) and not self._added:
             return f"{few}; done before"
         added, done_before = "", ""
 
@@ -252,10 +255,9 @@ class PhotosToSplat:
                 line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}")
 
         worker = self.worker("cameras", "sadgs_ns.cli.cameras.command:process")
-        source = Path(os.path.abspath(self.source))
-        command = ["sadgs-process", str(source), str(self._scene), "--max-size", str(self.options.max_size)]
-        options = Process(source, self._scene, max_size=self.options.max_size)
-        summary = Summary(**self.call(worker, line, on_event, command, options))
+        source = os.path.abspath(self.source)
+        command = ["sadgs-process", source, str(self._scene), "--max-size", str(self.options.max_size)]
+        summary = Summary(**self.call(worker, line, on_event, command, self._process))
         again = " after a second attempt" if summary.attempts else ""
         found = f"{added}{summary.registered} of {summary.photos} photos registered{again}"
         self._settings.pop("few", None)

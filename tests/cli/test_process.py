@@ -40,7 +40,7 @@ from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
 from sadgs_ns.cli.cameras import command as program
 from sadgs_ns.cli.cameras import features, reconstruct
 from sadgs_ns.cli.cameras.colmap import make_model, start_colmap
-from sadgs_ns.cli.cameras.command import Process, main, photos_added, process
+from sadgs_ns.cli.cameras.command import Process, Scene, main, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
 from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, pairs_to_match
@@ -1216,7 +1216,7 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     assert (new.cameras[1].params == old.cameras[1].params).all() and len(new.cameras) == 1
     assert new.num_points3D() > old.num_points3D() and errors_of_centres(out, camera_centres()).max() < 0.05
     assert {path.name for path in (out / "work").iterdir()} == {"settings.json", "database.db", "model-10"}
-    assert photos_added(source, out) == []
+    assert Scene(Process(source, out, max_size=120)).added == 0
 
 
 @pytest.mark.hard_case("an added photo of another size", "has a camera of its own")

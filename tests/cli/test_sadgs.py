@@ -285,6 +285,9 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     told = r"sadgs: training: Unrecognized options: --no-such-option\. All that it printed is in "
     assert re.match(told, printed.err) and str(log) in printed.err
     assert "$ ns-train sadgs --data " in log.read_text("utf8")
+    shutil.copy2(sorted(photos.iterdir())[6], source)
+    assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
+    assert "(photos added: 1, such as 06.png); give another folder or delete it." in capsys.readouterr().err
 
 
 def test_the_command_that_compares_more_pairs_keeps_the_size(
@@ -409,6 +412,18 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
         assert main(arguments) == 130
     commands.clear()
     assert main(arguments) == 0 and commands[0][0] == "ns-train"
+
+
+def test_a_run_is_not_that_of_cameras_that_were_found_after_it(
+    photos: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    command, runs = [str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"], tmp_path / "out/training/sadgs"
+    assert main(command) == 0 and [run.name for run in runs.iterdir()] == ["run"]
+    shutil.rmtree(tmp_path / "out" / "scene")
+    commands.clear()
+    assert main(command) == 0 and [words[0] for words in commands] == ["sadgs-process", "ns-train", "sadgs-export"]
+    assert "done before" not in capsys.readouterr().out
+    assert "--load-dir" not in commands[1] and [run.name for run in runs.iterdir()] != ["run"]
 
 
 def test_the_process_that_exports_starts_while_training_runs(

@@ -72,7 +72,7 @@ class Process:
     """Every photo has its own zoom, which EXIF does not tell."""
 
 
-class _Scene:
+class Scene:
     """A scene's folder and the options for it; raises InputError if the scene was begun with others."""
 
     def __init__(self, options: Process) -> None:
@@ -152,7 +152,7 @@ def process(options: Process) -> Summary:
     RunError if COLMAP fails, and Interrupted if a signal came: the work so far is kept.
     """
     with Interrupts(waiting=lambda: True):
-        if (scene := _Scene(options)).finished and not scene.added:
+        if (scene := Scene(options)).finished and not scene.added:
             scene.remove_intermediate_files()
             _say("unchanged", f"{options.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)
@@ -170,7 +170,7 @@ def process(options: Process) -> Summary:
     return summary
 
 
-def _make(scene: _Scene, report: Report) -> Summary:
+def _make(scene: Scene, report: Report) -> Summary:
     options, work = scene.options, scene.work
 
     # It starts at once, to import what it needs while photos are read, and ends before its folder is left.
@@ -216,7 +216,7 @@ def _make(scene: _Scene, report: Report) -> Summary:
     return summary
 
 
-def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching) -> None:
+def _tell_work(scene: Scene, photos: Sequence[Photo], matching: Matching) -> None:
     before = {*scene.begun["photos"]} if scene.added else set()
     if scene.added:
         added = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
@@ -234,7 +234,7 @@ def _tell_work(scene: _Scene, photos: Sequence[Photo], matching: Matching) -> No
     _say("planned", f"{views - known} photos, up to {pairs:,} pairs to match.")
 
 
-def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:
+def _convert(scene: Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:
     """Convert photos as `convert_photos`, and write their opacities, and masks if they or the scene have any."""
     work, masks = scene.work, scene.masks
     converted, photos = convert_photos(folder, stored, work / "photos")
@@ -248,12 +248,6 @@ def _convert(scene: _Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path
     if transparent := write_alpha(converted, photos, work / "alpha"):
         _say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
     return converted, photos
-
-
-def photos_added(source: Path, out: Path) -> list[str]:
-    """Return the photos that were added to a folder since its scene was finished; raises as `find_source`."""
-    begun = read_settings(out / "work" / "settings.json", out)
-    return sorted({*find_source(source, out)[0]} - {*begun.get("photos", [])}) if "finished" in begun else []
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
