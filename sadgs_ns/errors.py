@@ -16,6 +16,9 @@ _NERFSTUDIOS: dict[tuple[str, type[Exception], str], str] = {
         "may be relative to the folder in which the run was started.",
     ("utils.eval_utils.eval_setup", AssertionError, ""):
         "The file that --load-config names is no config.yml of a run: give it one.",
+    ("utils.eval_utils.eval_load_checkpoint", Exception, ""):
+        "The latest checkpoint in the run's folder nerfstudio_models cannot be read ({reason}): remove it, and the one "
+        "before it is taken if there is one, or train on with --load-dir and the run's folder.",
     ("cameras.camera_utils.get_interpolated_poses_many", ValueError, "at least one array"):
         "A path between views needs two of them, and the run holds out fewer: add --pose-source train, which takes the "
         "training views.",

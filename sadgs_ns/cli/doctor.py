@@ -84,8 +84,7 @@ def _load_torchvision() -> None:
     import torch
 
     spec = importlib.util.find_spec("torchvision")
-    libraries = [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*"))
-    if libraries:
+    if libraries := [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*")):
         torch.ops.load_library(libraries[0])
     else:
         import torchvision  # noqa: F401

@@ -51,7 +51,7 @@ def no_programs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def said_of(command: Any) -> str | None:
     """What is printed in place of the traceback."""
-    with pytest.raises((ValueError, OSError, AssertionError, AttributeError)) as failed:
+    with pytest.raises((ValueError, OSError, AssertionError, AttributeError, RuntimeError, EOFError)) as failed:
         command.main()
     return errors.sentence_of(failed.value)
 
@@ -126,6 +126,19 @@ def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp
     assert said_of(ComputePSNR(run[1], tmp_path / "results.txt")) == (
         "--output-path must end with .json: give the file of results another name."
     )
+
+
+@pytest.mark.hard_case(
+    "`ns-eval`, `ns-render` or `ns-viewer` of a run whose latest checkpoint is cut off", "one sentence"
+)
+@pytest.mark.parametrize("size", [0, 5000, 20_000])
+def test_a_damaged_checkpoint_is_named(size: int, run: tuple[int, Path]):
+    (checkpoint,) = run[1].parent.glob("nerfstudio_models/*.ckpt")
+    damaged = checkpoint.with_name("step-000000009.ckpt")
+    damaged.write_bytes(checkpoint.read_bytes()[:size])
+    said = said_of(ComputePSNR(run[1]))
+    damaged.unlink()
+    assert said is not None and said.startswith("The latest checkpoint in the run's folder nerfstudio_models cannot be")
 
 
 @pytest.mark.hard_case("`--vis wandb` or `--vis comet` without a login", "one sentence")
