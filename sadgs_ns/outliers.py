@@ -25,6 +25,7 @@ def far_outliers(positions: NDArray[np.floating], share: float) -> NDArray[np.bo
     sound = positions[~outliers].astype(np.float64)
     with np.errstate(over="ignore"):  # squares of numbers that are nearly infinite
         distances = np.linalg.norm(sound - np.median(sound, axis=0), axis=-1)
-    if (usual := np.partition(distances, rank := int(share * (len(sound) - 1)))[rank]) > 0:
+    usual = np.partition(distances, rank := int(share * (len(sound) - 1)))[rank]
+    if usual > 0:
         outliers[~outliers] = distances > REACH * usual
     return outliers

@@ -41,7 +41,8 @@ def write_mesh(
         similarity: From the parameters' frame to the file's; None leaves the mesh as it is.
         voxel_size: Edge of a voxel in the parameters' frame; None derives it from the median depth.
     """
-    if not (number := len(cameras.sizes)):
+    number = len(cameras.sizes)
+    if not number:
         raise InputError("The capture has no training views to fuse the depth of: give another with --data.")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     sound = torch.stack([value.flatten(1).isfinite().all(dim=1) for value in params.values()]).all(dim=0)  # [N]

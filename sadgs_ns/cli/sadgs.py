@@ -117,7 +117,9 @@ class PhotosToSplat:
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}
         if self._camera_file:
             asked["--cameras"] = f"{self._camera_file} (checksum {zlib.crc32(self._camera_file.read_bytes()):08x})"
-            asked["images"] = image_checksum(self.source if self.source.is_dir() else self.source.parent)
+            asked["images"] = image_checksum(
+                self._camera_file, self.source if self.source.is_dir() else self.source.parent
+            )
         asked |= {"--effort": options.effort, "options of ns-train": list(self.train_options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
@@ -239,7 +241,8 @@ class PhotosToSplat:
         with contextlib.suppress(InputError):  # It is about another folder.
             if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
                 line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
-        if (few := self._settings.get("few")) and (self.options.anyway or self._checkpoint()) and not self._added:
+        few = self._settings.get("few")
+        if few and (self.options.anyway or self._checkpoint()) and not self._added:
             return f"{few}; done before"
         added, done_before = "", ""
 

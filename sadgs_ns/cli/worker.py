@@ -117,7 +117,8 @@ class Worker:
                 *lines, rest = (rest + file.read()).split(b"\n")
                 for line in lines:
                     fields = json.loads(line)
-                    if (event := fields.pop("event")) == "result":
+                    event = fields.pop("event")
+                    if event == "result":
                         if self._saves:  # Its threads may be writing.
                             self._process.wait()
                         return fields["value"]
@@ -130,7 +131,8 @@ class Worker:
         with self.log.open("rb") as file:
             file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
             output = file.read().decode(errors="replace")
-        if (exitcode := self._process.returncode) < 0:
+        exitcode = self._process.returncode
+        if exitcode < 0:
             name = signal.Signals(-exitcode).name
             sentence = f"it was ended by {name}" + ", most likely for want of memory" * (name == "SIGKILL")
         raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
@@ -185,7 +187,8 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(128 + signal.SIGINT) from None
     except Exception as error:
-        if (sentence := sentence_of(error)) is None:
+        sentence = sentence_of(error)
+        if sentence is None:
             tracebacks.print_exc()
             sentence = tracebacks.format_exception_only(error)[-1].strip()
         else:

@@ -68,7 +68,8 @@ class _Binary:
 
     def text(self) -> str:
         """Return the next string, which ends with a zero byte."""
-        if (end := self.content.find(b"\0", self.offset, self.offset + 4096)) < 0:
+        end = self.content.find(b"\0", self.offset, self.offset + 4096)
+        if end < 0:
             raise self.corrupt(f"at byte {self.offset} there is no image's name")
         raw, self.offset = self.content[self.offset : end], end + 1
         try:

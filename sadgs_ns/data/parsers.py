@@ -141,7 +141,8 @@ class TransformsParser(_PointsOfPly, Nerfstudio):
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
-        if (model := path.parent / COLMAP_FOLDERS[0]).exists():
+        model = path.parent / COLMAP_FOLDERS[0]
+        if model.exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
         with mock.patch.object(nerfstudio_dataparser, "load_from_json", read_transforms):
             outputs = super()._generate_dataparser_outputs(split)

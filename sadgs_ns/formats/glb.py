@@ -58,7 +58,8 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     }
     head = json.dumps(document).encode()
     head += b" " * (-len(head) % 4)
-    if (total := 12 + 8 + len(head) + 8 + sum(sizes)) > _MOST_BYTES:
+    total = 12 + 8 + len(head) + 8 + sum(sizes)
+    if total > _MOST_BYTES:
         problem = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
         raise InputError(f"{problem}: choose another format.")
     file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(head), 0x4E4F534A) + head)

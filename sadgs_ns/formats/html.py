@@ -73,7 +73,8 @@ def _settings(start: Start) -> dict[str, Any]:
 def _page() -> bytes:
     """Return the page of a single Gaussian."""
     remedy = "install Node.js 22 or newer, be online the first time, or choose another format"
-    if (npx := shutil.which("npx")) is None:
+    npx = shutil.which("npx")
+    if npx is None:
         raise InputError(f"HTML is written with the help of Node.js, whose npx is not there: {remedy}.")
     one = np.zeros((1, 3), np.float32)
     point = Gaussians(one, one - 5, np.eye(1, 4, dtype=np.float32), one[:, 0], one, np.zeros((1, 0, 3), np.float32))

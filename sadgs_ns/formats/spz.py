@@ -59,7 +59,8 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
 
 def _fractional_bits(reach: float) -> int:
     """Return how many of a position's 23 bits can be behind the point."""
-    if (bits := min(_MOST_BITS, 22 - math.floor(math.log2(max(reach, 1e-6))))) < _LEAST_BITS:
+    bits = min(_MOST_BITS, 22 - math.floor(math.log2(max(reach, 1e-6))))
+    if bits < _LEAST_BITS:
         raise InputError(
             f"The Gaussians reach {reach:,.0f} units from the origin, so that SPZ would hold positions in steps "
             f"of over 1/{1 << _LEAST_BITS} of a unit: take the far ones away with --crop, or choose another format."

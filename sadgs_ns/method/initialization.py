@@ -50,7 +50,8 @@ def neighbour_scales(points: Tensor) -> Tensor:
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
     extent = float((points.amax(0) - points.amin(0)).norm()) or 1.0
-    if (k := min(3, len(points) - 1)) < 1:
+    k = min(3, len(points) - 1)
+    if k < 1:
         return torch.full_like(points[:, 0], 0.01 * extent)
     array = points.detach().cpu().numpy()
     distances, _ = KDTree(array).query(array, k + 1, workers=-1)  # scikit-learn's takes half a second to import

@@ -38,7 +38,8 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     `means2d` has its `absgrad` and what `keep_gradient` kept.
     """
     means2d = info["means2d"]
-    if (gradient := getattr(means2d, "grad2d", None)) is None:
+    gradient = getattr(means2d, "grad2d", None)
+    if gradient is None:
         gradient = means2d.grad
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
     scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views

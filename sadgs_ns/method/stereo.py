@@ -165,7 +165,8 @@ def _pyramid(image: Tensor, mask: Tensor | None, device: torch.device) -> list[T
     # The coarsest level's stride divides the sides, so that a level's pixels are exact quarters of the next one's.
     stride = 2 ** (LEVELS - 1)
     factor = min(1.0, WORKING_SIDE / max(level.shape[2:])) / stride
-    if (size := [stride * max(round(side * factor), 1) for side in level.shape[2:]]) != list(level.shape[2:]):
+    size = [stride * max(round(side * factor), 1) for side in level.shape[2:]]
+    if size != list(level.shape[2:]):
         level = _mean(F.interpolate(level, size, mode="bilinear", align_corners=False, antialias=True))
     levels = [level]
     for _ in range(LEVELS - 1):

@@ -73,7 +73,8 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
     files = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in sorted(load_dir.glob("*")))
-    if not (steps := {int(match[1]): path for match, path in files if match}):
+    steps = {int(match[1]): path for match, path in files if match}
+    if not steps:
         below = [path.parent for depth in ("*", "*/*", "*/*/*") for path in load_dir.glob(f"{depth}/{_FOLDER}")]
         latest = max(below, key=lambda run: (run / _FOLDER).stat().st_mtime, default=None)
         example = "" if latest is None else f", such as {latest}"

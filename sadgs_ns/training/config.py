@@ -343,7 +343,8 @@ class SadgsTrainerConfig(TrainerConfig):
 
     def _check_machine(self) -> None:
         """Raise InputError if a device is not there, or several cannot work with these options."""
-        if (device := self.machine.device_type) == "cuda" and not torch.cuda.is_available():
+        device = self.machine.device_type
+        if device == "cuda" and not torch.cuda.is_available():
             problem = "machine.device_type is cuda, but torch finds no CUDA device"
             raise InputError(f"{problem}: set it to cpu, or install torch for CUDA.")
         model, several = self.pipeline.model, processes.check_devices(self.machine)

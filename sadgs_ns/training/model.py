@@ -104,7 +104,8 @@ class SadgsModel(SplatfactoModel):
         They have means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], in world units; the
         distance to neighbours limits these, too.
         """
-        if not (room := max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)):
+        room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
+        if not room:
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]
         means, scales = means[:room], scales[:room]

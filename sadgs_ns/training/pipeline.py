@@ -188,7 +188,8 @@ class SadgsPipeline(VanillaPipeline):
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, float]:
         """Return the mean, and for several views the deviation, of each metric; raise InputError without views."""
-        if (views := len(self.datamanager.eval_dataset)) == 0:
+        views = len(self.datamanager.eval_dataset)
+        if views == 0:
             problem = "The run holds out no view, so that there is nothing to measure"
             raise InputError(f"{problem}: train with one of the parser's --eval-mode that holds out some.")
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)

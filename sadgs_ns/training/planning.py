@@ -35,7 +35,8 @@ def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
     """Tell whether steps of so many views have too few pixels for several devices, and print so."""
-    if (pixels := views * _pixels(cameras)) >= LEAST_PIXELS * devices:
+    pixels = views * _pixels(cameras)
+    if pixels >= LEAST_PIXELS * devices:
         return False
     note(
         f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "
@@ -82,7 +83,8 @@ def plan_run(
     clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.for_run(length.iterations)
-    if (windows := planned.windows).refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
+    windows = planned.windows
+    if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
         warn(
             f"{length.iterations} iterations are too few for a structure-aware split: densification ends at "
             f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "

@@ -39,7 +39,8 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
 
     It loads the images. Returns whether the run starts, or started, from such points.
     """
-    if not (number := number_of_points(pipeline)) or resumed:
+    number = number_of_points(pipeline)
+    if not number or resumed:
         return number > 0
     model, cache = pipeline.model, pipeline.structure_cache
     cached = pipeline.datamanager.cached_train  # Undistorting images changes cameras.

@@ -82,7 +82,8 @@ class StructureCache:
     @cached_property
     def _room(self) -> list[Tensor]:
         """Host memory for S̄ of decoded images, uint8 [H, W, 3] each; pinning it later would wait for the device."""
-        if (prefetcher := self.views.prefetcher) is None or not prefetcher.decoded:
+        prefetcher = self.views.prefetcher
+        if prefetcher is None or not prefetcher.decoded:
             return []
         pinned = self.views.model.device.type == "cuda"
         return [torch.empty((*size, 3), dtype=torch.uint8, pin_memory=pinned) for size in self.views.sizes]

@@ -275,7 +275,8 @@ class SadgsTrainer(Trainer):
         """Save a checkpoint, and name it in `config.yml`; return if the run was done, else raise SystemExit."""
         if self._completed_step > self._saved_step:
             self.save_checkpoint(self._completed_step)
-        if (done := self._completed_step + 1) >= total:
+        done = self._completed_step + 1
+        if done >= total:
             return
         if done == self._start_step:
             text = f"{interrupted}: {_NOTHING_DONE}"

@@ -88,7 +88,8 @@ class TrainingViews:
     @cached_property
     def prefetcher(self) -> ImagePrefetcher | None:
         """Brings images from the host ahead of their step; None if all images are on the device."""
-        if (config := self.datamanager.config).cache_images == "gpu":
+        config = self.datamanager.config
+        if config.cache_images == "gpu":
             return None
         threads = thread_count(config.max_thread_workers)
         return ImagePrefetcher(self.datamanager.cached_train, self.model.device, threads)
@@ -120,7 +121,8 @@ class TrainingViews:
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""
-        if not (world := self.model.world).alone:
+        world = self.model.world
+        if not world.alone:
             sizes = tuple(self.sizes[index] for index in indices)
             indices = [indices[position] for position in views_of_rank(sizes, world.num_ranks, world.rank)]
         return list(dict.fromkeys(indices))
@@ -146,7 +148,8 @@ class TrainingViews:
     def viewmat(self, index: int) -> Tensor:
         """World-to-camera matrix of a training view, corrected by the camera optimizer. [4, 4]"""
         viewmats, _ = self.cameras
-        if (optimizer := self.model.camera_optimizer).config.mode == "off":
+        optimizer = self.model.camera_optimizer
+        if optimizer.config.mode == "off":
             return viewmats[index]
         camera = self.datamanager.train_cameras[index : index + 1].to(self.model.device)
         camera.metadata = {"cam_idx": index}

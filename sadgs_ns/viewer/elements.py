@@ -51,7 +51,8 @@ def show_output(control: ViewerControl, name: str) -> None:
 
 def shows_output(control: ViewerControl, name: str) -> bool:
     """Tell whether the viewer shows one of its output types, in the whole window or in half of it."""
-    if (viewer := getattr(control, "viewer", None)) is None:
+    viewer = getattr(control, "viewer", None)
+    if viewer is None:
         return False
     panel = viewer.control_panel
     return name == panel.output_render or (panel.split and name == panel.split_output_render)

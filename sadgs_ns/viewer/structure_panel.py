@@ -60,7 +60,8 @@ def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
 def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
     """Return Markdown of the number of Gaussians, and of how structure steps, AbsGS and pruning changed it."""
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
-    if not (steps := state.get("structure_steps", [])[-ROWS:]):
+    steps = state.get("structure_steps", [])[-ROWS:]
+    if not steps:
         return "\n".join([*lines, "No structure step yet."])
     lines += ["| iteration | step | violate | low | Gaussians |", "| --- | --- | --- | --- | --- |"]
     number, last = steps[0]["before"], ""
@@ -196,7 +197,8 @@ class StructurePanel(torch.nn.Module):
         `picture` does not do so, because the viewer aborts drawing at any line when its camera moves, and photos that
         are undistorted twice would be wrong.
         """
-        if (chosen := self.choice.value) in OF_STATISTICS and self.statistics() is None:
+        chosen = self.choice.value
+        if chosen in OF_STATISTICS and self.statistics() is None:
             self.observe_now()
         elif chosen in OF_PHOTOS:
             self._read_photos()

@@ -482,12 +482,16 @@ def test_cameras_that_a_folder_brings_are_used(
         f"--max-size is for new cameras, and those of {source / used} are used: leave it out, or for"
         in capsys.readouterr().err
     )
-    extra = source / "images" / "mask.png"
-    extra.write_bytes(b"another image")
+    (source / "renders").mkdir()
+    rendering = Path(shutil.copy(image := min((source / "images").iterdir()), source / "renders"))
+    assert main(command) == 0, "a rendering of the run is no image of the capture"
+    shutil.rmtree(rendering.parent)
+    whole = image.read_bytes()
+    image.write_bytes(whole + b" ")
     assert main(command) == 2
     said = re.escape(f"{tmp_path}/out was begun with other settings (images was ") + r"\d+ \(checksum \w+\), is \d+ \(c"
     assert re.search(said, capsys.readouterr().err)
-    extra.unlink()
+    image.write_bytes(whole)
     (source / used).write_bytes((source / used).read_bytes() + b" ")
     assert main(command) == 2
     assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err

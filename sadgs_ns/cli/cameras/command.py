@@ -152,7 +152,8 @@ def process(options: Process) -> Summary:
     RunError if COLMAP fails, and Interrupted if a signal came: the work so far is kept.
     """
     with Interrupts(waiting=lambda: True):
-        if (scene := Scene(options)).finished and not scene.added:
+        scene = Scene(options)
+        if scene.finished and not scene.added:
             scene.remove_intermediate_files()
             _say("unchanged", f"{options.out} is finished; delete it to make it again.")
             summary = Summary(**scene.finished)

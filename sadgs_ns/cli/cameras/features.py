@@ -97,7 +97,8 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
     with Image.open(photos / views[0]) as image:
         side = image.width
     rigs = [rig for rig in opened.read_all_rigs() if rig.num_sensors() == VIEWS]
-    if (rig := next((rig for rig in rigs if opened.read_camera(rig.ref_sensor_id.id).width == side), None)) is None:
+    rig = next((rig for rig in rigs if opened.read_camera(rig.ref_sensor_id.id).width == side), None)
+    if rig is None:
         camera = pycolmap.Camera(model="PINHOLE", width=side, height=side, params=[side / 2] * 4)
         ids, to_panorama, rig = [opened.write_camera(camera) for _ in views], rotations(), pycolmap.Rig()
         sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id) for camera_id in ids]
@@ -125,11 +126,13 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
     points, values = (), None
     if image is not None:
         height, width = image.shape
-        if (shrink := min(1.0, MAX_SIDE / max(width, height))) < 1:
+        shrink = min(1.0, MAX_SIDE / max(width, height))
+        if shrink < 1:
             size = max(1, round(shrink * width)), max(1, round(shrink * height))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         finder = cv2.SIFT.create(MOST_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-        if (searched := cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask and mask.exists() else None) is not None:
+        searched = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask and mask.exists() else None
+        if searched is not None:
             searched = cv2.resize(searched, image.shape[::-1], interpolation=cv2.INTER_NEAREST)
         points, values = finder.detectAndCompute(image, searched)  # type: ignore[arg-type] # None is no mask.
     if image is None or values is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
+import json
 import math
 import os
 import re
@@ -80,11 +81,22 @@ def _visible_files(folder: Path) -> list[str]:
     return [name for name in names if "/." not in f"/{name}"]
 
 
-def image_checksum(folder: Path) -> str:
-    """Return the number of a folder's images, with a checksum of their names and sizes in bytes."""
+def image_checksum(cameras: Path, folder: Path) -> str:
+    """Return the number of a capture's images and masks, with a checksum of their names and sizes in bytes.
+
+    They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, and in
+    its `images` and `masks`: renderings of a run may lie in other folders.
+    """
     images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
-    sizes = ((folder / name).stat().st_size if (folder / name).exists() else 0 for name in images)
-    return f"{len(images)} (checksum {zlib.crc32(repr([*zip(images, sizes, strict=True)]).encode()):08x})"
+    names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in ("", "images", "masks")]
+    if cameras.suffix == ".json":
+        try:
+            frames = json.loads(cameras.read_bytes())["frames"]
+            names = [str(frame.get(key)) for frame in frames for key in ("file_path", "mask_path")]
+        except (ValueError, TypeError, KeyError, AttributeError):
+            return "unknown"  # Training tells what is wrong with the file.
+    sizes = [(folder / name).stat().st_size for name in names if (folder / name).is_file()]
+    return f"{len(sizes)} (checksum {zlib.crc32(repr([names, sizes]).encode()):08x})"
 
 
 def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:

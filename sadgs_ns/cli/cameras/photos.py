@@ -220,7 +220,8 @@ def write_masks(
 def restore_alpha(images: Path, alphas: Path) -> None:
     """Give those images that exist the opacity that `write_alpha` wrote, which has their size."""
     for path in alphas.rglob("*.png"):
-        if (target := images / path.relative_to(alphas).with_suffix("")).exists():
+        target = images / path.relative_to(alphas).with_suffix("")
+        if target.exists():
             with Image.open(target) as image, Image.open(path) as alpha:
                 pixels = image.convert("RGB")
                 pixels.putalpha(alpha.convert("L"))

@@ -294,7 +294,8 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
             progress("undistorted photos", written, len(registered))
         undistortion.result()
     for kind, image in itertools.product(("alpha", "masks"), registered):
-        if (stored := model.with_name(kind) / f"{image.name}.png").exists():
+        stored = model.with_name(kind) / f"{image.name}.png"
+        if stored.exists():
             target = folder / kind / f"{image.name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             grey = pycolmap.Bitmap.read(stored, as_rgb=False)
@@ -324,7 +325,8 @@ def summarize(
             for identity in pycolmap.pair_id_to_image_pair(pair):
                 matches[identity] = max(matches[identity], count)
         for name in set(names) - registered:
-            if (identity := identities.get(name)) is None:
+            identity = identities.get(name)
+            if identity is None:
                 left_out[name] = "could not be read"
             elif (count := opened.num_keypoints_for_image(identity)) < FEW_FEATURES:
                 left_out[name] = f"only {count} features: blurred, dark or without texture"

@@ -120,7 +120,8 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
         told = f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart"
         yield fault(f"{told}, which float32 cannot tell apart: subtract their centre from all poses and points.")
-    if (far := far_outliers(centres, CAMERA_SHARE)).any():
+    far = far_outliers(centres, CAMERA_SHARE)
+    if far.any():
         where = and_more(views[int(far.argmax())].where, int(far.sum()))
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
         is_too_far = distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread
@@ -201,7 +202,8 @@ def check_points(positions: NDArray[np.floating], views: Sequence[View], path: P
 
 def _check_distances(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
     positions = positions.astype(np.float64)
-    if (far := far_outliers(positions, POINT_SHARE)).any():
+    far = far_outliers(positions, POINT_SHARE)
+    if far.any():
         told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
         yield note(f"{path} has {told}: training leaves them out.")
     positions = positions[~far]
@@ -214,7 +216,8 @@ def _check_distances(positions: NDArray[np.floating], views: Sequence[View], pat
         kind = fault if distance > 1e5 * spread else warning
         yield kind(f"{told}, so that all images see them from one direction: {remedy}.")
         return
-    if (seeing := _share_of_views_with_points(positions, views)) < 0.5:
+    seeing = _share_of_views_with_points(positions, views)
+    if seeing < 0.5:
         whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
         yield (warning if seeing else fault)(f"{path} has points that {whom} can see in front of it: {remedy}.")
 

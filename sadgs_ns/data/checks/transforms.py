@@ -32,7 +32,8 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 @collect_findings
 def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a `transforms.json`, or the one in a folder, and its images if asked."""
-    if not (path := data if data.suffix == ".json" else data / "transforms.json").is_file():
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    if not path.is_file():
         raise InputError(_no_transforms(data, path))
     folder, meta = path.parent, read_transforms(path)
     described, model = meta["frames"], meta.get("camera_model", "OPENCV")
