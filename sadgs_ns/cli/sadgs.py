@@ -117,9 +117,7 @@ class PhotosToSplat:
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}
         if self._camera_file:
             asked["--cameras"] = f"{self._camera_file} (checksum {zlib.crc32(self._camera_file.read_bytes()):08x})"
-            asked["images"] = image_checksum(
-                self._camera_file, self.source if self.source.is_dir() else self.source.parent
-            )
+            asked["images"] = image_checksum(self._camera_file, self.source)
         asked |= {"--effort": options.effort, "options of ns-train": list(self.train_options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):

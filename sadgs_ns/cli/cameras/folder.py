@@ -81,20 +81,22 @@ def _visible_files(folder: Path) -> list[str]:
     return [name for name in names if "/." not in f"/{name}"]
 
 
-def image_checksum(cameras: Path, folder: Path) -> str:
+def image_checksum(cameras: Path, source: Path) -> str:
     """Return the number of a capture's images and masks, with a checksum of their names and sizes in bytes.
 
     They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, and in
     its `images` and `masks`: renderings of a run may lie in other folders.
     """
-    images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
-    names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in ("", "images", "masks")]
+    folder = source if source.is_dir() else source.parent
     if cameras.suffix == ".json":
         try:
             frames = json.loads(cameras.read_bytes())["frames"]
             names = [str(frame.get(key)) for frame in frames for key in ("file_path", "mask_path")]
         except (ValueError, TypeError, KeyError, AttributeError):
             return "unknown"  # Training tells what is wrong with the file.
+    else:
+        images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+        names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in ("", "images", "masks")]
     sizes = [(folder / name).stat().st_size for name in names if (folder / name).is_file()]
     return f"{len(sizes)} (checksum {zlib.crc32(repr([names, sizes]).encode()):08x})"
 
@@ -107,7 +109,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     files = _visible_files(folder)
-    scenes = {scene, *((folder / name).parents[1] for name in files if name.endswith("/work/settings.json"))}
+    settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
+    scenes = {scene, *(path.parents[1] for path in settings)}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
     found, stems, masks = defaultdict(list), defaultdict(list), {}
     for name in files:

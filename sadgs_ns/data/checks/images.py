@@ -224,12 +224,11 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
         with path.open("rb") as file:
             file.seek(-2, 2)
             return file.read() == b"\xff\xd9"
-    with suppress(
-        Exception
-    ):  # It raises anything, also for a file that lacks its last bytes alone, which decodes well.
-        if image.format == "PNG":
-            image.verify()  # This reads its checksums.
-            return True
+    if image.format != "PNG":
+        return False
+    with suppress(Exception):  # It raises anything, also where the last bytes alone lack, which decodes well.
+        image.verify()  # This reads its checksums.
+        return True
     return False
 
 
