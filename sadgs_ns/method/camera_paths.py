@@ -17,12 +17,12 @@ from torch import Tensor
 
 REACH = 1.5
 """Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md#exported-files)."""
+FEW_VIEWS, REACH_OF_MANY = 60, 1.0
+"""Training views up to which it reaches so far, and its reach with more, where 1.5 cost site .2 dB."""
 HAZE_ANGLE = 0.1
 """Haze has a longest standard deviation of more than this share of its distance from a path. With 0.2 some stayed."""
 SUPPORT = 2.0
 """A Gaussian stands for a surface if a point to start from lies within this many of its standard deviations."""
-MOST_VIEWS = 60
-"""Training views up to which a run prunes it, where nobody says. Of more views, files lost nothing without."""
 NEIGHBOURS = 4  # A path leads from each camera to so many of the others, the nearest that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
 _CELLS = 32  # Cells on each side of a grid that tells which Gaussians may be near a path
@@ -36,7 +36,7 @@ class CameraPaths:
     starts: Tensor  # World units. [E, 3]
     ends: Tensor  # World units. [E, 3]
     reach: float  # Distance up to which the space around the paths is empty, in world units
-    points: Tensor  # Points of surfaces that may be near enough to count. [P, 3]
+    points: Tensor  # Points of surfaces around the paths. [P, 3]
     corner: Tensor  # Smallest coordinates of a grid around the paths. [3]
     cell: float  # Side of its cells, which are cubes
     near: Tensor  # Which of its cells reach into the empty space. bool [32, 32, 32]
@@ -58,14 +58,15 @@ class CameraPaths:
         pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values.isfinite()].sort(dim=1).values
         pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
-        reach = REACH * near_plane
+        reach = near_plane * (REACH if len(centres) <= FEW_VIEWS else REACH_OF_MANY)
         corner, far = starts.amin(dim=0) - reach, starts.amax(dim=0) + reach
         cell = float((far - corner).max()) / _CELLS
         middles = (torch.arange(_CELLS, device=points.device) + 0.5) * cell
         grid = corner + torch.stack(torch.meshgrid(middles, middles, middles, indexing="ij"), dim=-1)  # [32, 32, 32, 3]
         near = _distances(grid.view(-1, 3), starts, ends).view(grid.shape[:3]) <= reach + cell * math.sqrt(3) / 2
-        close = _distances(points, starts, ends) <= (1 + 2 * SUPPORT) * reach
-        return CameraPaths(starts, ends, reach, points[close], corner, cell, near)
+        margin = 2 * SUPPORT * reach  # No other point is near enough to what `haze` looks at.
+        around = ((points >= corner - margin) & (points <= far + margin)).all(dim=1)
+        return CameraPaths(starts, ends, reach, points[around], corner, cell, near)
 
     @cached_property
     def surfaces(self) -> KDTree:

@@ -82,9 +82,8 @@ class SadgsModelConfig(InstantiateConfig):
     stereo_points: int | None = None
     """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
     None is 150,000 where there are 3 to 60 training views, and otherwise none."""
-    clear_paths: bool | None = None
-    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze.
-    None does so where there are at most 60 training views."""
+    clear_paths: bool = True
+    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1."""
     sh_degree: int = 3

@@ -18,7 +18,7 @@ from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.method.camera_paths import MOST_VIEWS, CameraPaths
+from sadgs_ns.method.camera_paths import CameraPaths
 from sadgs_ns.method.initialization import camera_extent, neighbour_scales
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.near_plane import scene_near_plane
@@ -118,9 +118,8 @@ class SadgsModel(SplatfactoModel):
         return room
 
     def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune haze near the training cameras [C, 4, 4], unless the options forbid it."""
-        asked = self.config.clear_paths
-        if len(viewmats) <= MOST_VIEWS if asked is None else asked:
+        """Let densification prune haze near the training cameras [C, 4, 4], if the options ask for it."""
+        if self.config.clear_paths:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
 

@@ -21,7 +21,7 @@ from sadgs_ns.data.parsers import points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training import datamanager, model, pipeline, presets, stereo_start
+from sadgs_ns.training import datamanager, pipeline, presets, stereo_start
 from sadgs_ns.training.images import LazyImages
 
 
@@ -140,15 +140,10 @@ def test_the_paper_s_presets_start_as_the_paper_says():
     assert [(m.stereo_points, m.clear_paths, m.near_plane) for m in models] == [(0, False, None)] * 2
 
 
-@pytest.mark.parametrize(
-    ("asked", "most", "kept"), [(None, 60, True), (None, 6, False), (True, 6, True), (False, 60, False)]
-)
-def test_the_paths_of_few_cameras_are_kept_clear_unless_somebody_says_otherwise(
-    asked: bool | None, most: int, kept: bool, config: Any, monkeypatch: pytest.MonkeyPatch
-):
+@pytest.mark.parametrize("asked", [True, False])
+def test_the_cameras_paths_are_kept_clear_if_the_options_ask_for_it(asked: bool, config: Any):
     config.pipeline.model.stereo_points, config.pipeline.model.clear_paths = 0, asked
-    monkeypatch.setattr(model, "MOST_VIEWS", most)
-    assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == kept
+    assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == asked
 
 
 def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
