@@ -141,7 +141,8 @@ class Run:
         found = []
         for group, base in zip(self.cell, self.base, strict=False):
             goal = {name: mean(base, name) for name in DIGITS}
-            found += [seconds_to_match(run, run if any(run is other for other in base) else goal) for run in group]
+            timed = [run for run in group if run.get("loop_seconds") is not None]  # Others ran on another host.
+            found += [seconds_to_match(run, run if any(run is other for other in base) else goal) for run in timed]
         if None in found or not found:
             return NOTHING
         seconds = statistics.median(value for value in found if value is not None)

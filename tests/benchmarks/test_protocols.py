@@ -141,11 +141,22 @@ def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
         "no AbsGS": {f"{strategy}.absgs_every": 0},
         "no bounding-box points": {"pipeline.model.bounding_box_points": False},
     }
-    assert set(built) == {(scene, label) for scene in ("bonsai", "fox", "south") for label in changes}
+    dense = {"pipeline.model.stereo_points": 150_000}
+    of_castle = {
+        "AbsGS": {},
+        "no AbsGS": changes["no AbsGS"],
+        "AbsGS, dense start": dense,
+        "no AbsGS, dense start": changes["no AbsGS"] | dense,
+    }
+    assert set(built) == {
+        *((scene, label) for scene in ("bonsai", "fox", "south") for label in changes),
+        *(("castle-4", label) for label in of_castle),
+    }
     for row in load("ablations").rows:
-        assert row.overrides == changes[row.label]
         for scene in row.scenes or ():
-            assert built[scene, row.label].method_name == ("sadgs-paper" if scene == "south" else "sadgs-paper-indoor")
+            assert row.overrides == (of_castle if scene == "castle-4" else changes)[row.label]
+            indoor = scene in ("bonsai", "fox")
+            assert built[scene, row.label].method_name == ("sadgs-paper-indoor" if indoor else "sadgs-paper")
 
 
 def test_the_progressive_rows_add_one_thing_each(tmp_path: Path):

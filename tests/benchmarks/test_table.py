@@ -71,7 +71,10 @@ def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_referen
         measured(2, (1.0, 33.0, 0.2)),
     ]
     never = [measured(0, (1.0, 33.0, 0.2))]
+    elsewhere = result(loop_seconds=None)
     assert table.Run("fox", "ours", [ours], [THEIRS]).matched() == "3.0"
+    assert table.Run("fox", "ours, one of another host", [[*ours, elsewhere]], [THEIRS]).matched() == "3.0"
+    assert table.Run("fox", "of another host", [[elsewhere]], [THEIRS]).matched() == "–"
     assert table.Run("fox", "theirs", [THEIRS], [THEIRS]).matched() == "22.0"
     assert table.Run("fox", "never", [never], [THEIRS]).matched() == "never"
     assert table.Run("fox", "alone", [ours]).matched() == "–"
