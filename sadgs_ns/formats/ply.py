@@ -8,8 +8,7 @@ import numpy as np
 
 from sadgs_ns.formats.gaussians import Context, Gaussians
 
-_ROWS = 1 << 16
-"""Number of Gaussians that are converted at a time, so that writing takes little memory beyond their own."""
+_ROWS = 1 << 16  # Gaussians that are converted at a time, so that writing takes little memory beyond their own
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:

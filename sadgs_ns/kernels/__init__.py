@@ -25,8 +25,7 @@ SWITCH = "SADGS_TRITON"  # Environment variable; 0 keeps a process from using th
 _forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
 """The answer of `use_triton`; None if the device decides."""
 _working: set[torch.device] = set()  # Devices on which a kernel has run
-_asked: Counter[torch.device] = Counter()
-"""Number of questions to `available` about a device on which no kernel had run."""
+_asked: Counter[torch.device] = Counter()  # Questions to `available` about a device on which no kernel had run
 
 
 def cdiv(number: int, block: int) -> int:

@@ -10,8 +10,7 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 
 _ROWS = 64  # Rows that one program handles
-_COLUMNS = 16
-"""A power of two ≥ the number of columns: centre 2, conic 3, opacity 1, colour 3, depth 1 and radius 1 or 2."""
+_COLUMNS = 16  # A power of two ≥ the columns: centre 2, conic 3, opacity 1, colour 3, depth 1 and radius 1 or 2
 
 
 @triton.jit

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 _PAIRS = 2**22  # Distances from Gaussians to cameras that are computed at a time, in three arrays of 16 MB
-_LEAST_LIMIT = 1e-7
-"""World units. A Gaussian around a camera's very centre keeps this size, so that its logarithm is finite."""
+_LEAST_LIMIT = 1e-7  # World units. A Gaussian around a camera's centre keeps this size, so that its logarithm is finite
 
 
 @torch.no_grad()

@@ -15,8 +15,7 @@ MARGIN = 1.25
 RECENT = 8  # Number of the latest visits among which the largest change is taken
 MOST_PAIRS = 2**25
 """Longer lists are not foreseen: their unused places would take 200 MB, and beside rendering a wait does not matter."""
-_SMALL = 1000
-"""Pairs that are added to both numbers of a change, so that a view of a few Gaussians tells little about others."""
+_SMALL = 1000  # Pairs that are added to both numbers of a change, so a view of few Gaussians tells little about others
 _LEAST_STEP = 4096  # Smallest step between two capacities
 
 

@@ -24,8 +24,7 @@ from sadgs_ns.training.optimizers import AdamUpdate
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.train_step import StepResult, ViewGroup, training_step
 
-MOST_GAUSSIANS = 2**20
-"""Steps of more Gaussians × views keep the GPU busy without a graph, which would only take memory."""
+MOST_GAUSSIANS = 2**20  # Steps of more Gaussians × views keep a GPU busy without a graph, which would only take memory
 MOST_GRAPHS = 16
 """Largest number of graphs. With images of many sizes, or views of very different numbers of Gaussians, steps would
 otherwise be captured more often than they are replayed."""

@@ -20,8 +20,7 @@ from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warnin
 from sadgs_ns.errors import reason
 
 MAX_AUTO_RESOLUTION = 1600  # Longest side in px up to which nerfstudio looks for no smaller copies of images
-MASK_MODES = ("L", "1", "I;16", "I")
-"""Pillow's modes that masks may have; nerfstudio trains on every pixel that is not 0."""
+MASK_MODES = ("L", "1", "I;16", "I")  # Pillow's modes of masks; nerfstudio trains on every pixel that is not 0
 NOT_UPRIGHT, SIDEWAYS = range(2, 9), range(5, 9)
 """EXIF's orientations, and those of them that exchange the sides. Pillow turns TIFF by itself, and nothing else."""
 _TURN = "turn their pixels as those poses want it, and take the tag away, as ImageMagick's `mogrify -auto-orient` does"
