@@ -15,17 +15,13 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-REACH = 1.5
-"""Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md#exported-files)."""
-FEW_VIEWS, REACH_OF_MANY = 60, 1.0
-"""Training views up to which it reaches so far, and its reach with more, where 1.5 cost site .2 dB."""
-HAZE_ANGLE = 0.1
-"""Haze has a longest standard deviation of more than this share of its distance from a path. With 0.2 some stayed."""
-SUPPORT = 2.0
-"""A Gaussian stands for a surface if a point to start from lies within this many of its standard deviations."""
+REACH = 1.5  # Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md)
+FEW_VIEWS, REACH_OF_MANY = 60, 1.0  # Training views up to which it is this, and with more, where 1.5 cost site .2 dB
+HAZE_ANGLE = 0.1  # Haze is longer, in standard deviations, than this share of its distance from a path; .2 left some
+SUPPORT = 2.0  # A Gaussian is of a surface if a point to start from lies within this many of its standard deviations
 NEIGHBOURS = 4  # A path leads from each camera to so many of the others, the nearest that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
-_CELLS = 32  # Cells on each side of a grid that tells which Gaussians may be near a path
+_CUBES = 2**12  # Cubes along each side of a grid, at most; float32 tells them apart
 _PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
 
 
@@ -37,9 +33,6 @@ class CameraPaths:
     ends: Tensor  # World units. [E, 3]
     reach: float  # Distance up to which the space around the paths is empty, in world units
     points: Tensor  # Points of surfaces around the paths. [P, 3]
-    corner: Tensor  # Smallest coordinates of a grid around the paths. [3]
-    cell: float  # Side of its cells, which are cubes
-    near: Tensor  # Which of its cells reach into the empty space. bool [32, 32, 32]
 
     @staticmethod
     def of(
@@ -52,26 +45,20 @@ class CameraPaths:
         centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
         distances = torch.cdist(centres, centres)
         unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
-        distances = distances.masked_fill(unlike, torch.inf).fill_diagonal_(torch.inf)
-        nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
+        nearest = distances.masked_fill_(unlike, torch.inf).fill_diagonal_(torch.inf)
+        nearest = nearest.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
         first = torch.arange(len(centres))[:, None].expand_as(nearest.indices)
         pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values.isfinite()].sort(dim=1).values
         pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
         reach = near_plane * (REACH if len(centres) <= FEW_VIEWS else REACH_OF_MANY)
-        corner, far = starts.amin(dim=0) - reach, starts.amax(dim=0) + reach
-        cell = float((far - corner).max()) / _CELLS
-        middles = (torch.arange(_CELLS, device=points.device) + 0.5) * cell
-        grid = corner + torch.stack(torch.meshgrid(middles, middles, middles, indexing="ij"), dim=-1)  # [32, 32, 32, 3]
-        near = _distances(grid.view(-1, 3), starts, ends).view(grid.shape[:3]) <= reach + cell * math.sqrt(3) / 2
-        margin = 2 * SUPPORT * reach  # No other point is near enough to what `haze` looks at.
-        around = ((points >= corner - margin) & (points <= far + margin)).all(dim=1)
-        return CameraPaths(starts, ends, reach, points[around], corner, cell, near)
+        # No other point is near enough to what `haze` looks at.
+        return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + 2 * SUPPORT) * reach)[0] > 0])
 
     @cached_property
     def surfaces(self) -> KDTree:
         """The points, to be searched for the nearest. Comparing all pairs took 40 % of castle's loop on a GPU."""
-        return KDTree(self.points.cpu().numpy())
+        return KDTree(self.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)  # is built soonest
 
     @torch.no_grad()
     def haze(
@@ -80,26 +67,47 @@ class CameraPaths:
         scales: Tensor,  # [N, 3]
     ) -> Tensor:
         """Tell which Gaussians are haze near a path; those whose centre is not finite are none. bool [N]"""
-        cells = ((means - self.corner) / self.cell).nan_to_num(-1.0).clamp(-1, _CELLS).floor().long()  # [N, 3]
-        inside = ((cells >= 0) & (cells < _CELLS)).all(dim=1)
-        x, y, z = cells.clamp(0, _CELLS - 1).unbind(dim=1)
-        found = (inside & self.near[x, y, z]).nonzero()[:, 0]  # [n]
-        sizes, distances = scales[found].amax(dim=1), _distances(means[found], self.starts, self.ends)
-        large = (distances < self.reach) & (sizes > HAZE_ANGLE * distances)
-        found, sizes = found[large], sizes[large].clamp_max(2 * self.reach)
+        haze, sizes = torch.zeros_like(means[:, 0], dtype=torch.bool), scales.amax(dim=1)
+        counts, firsts, listed = _near(means, self.starts, self.ends, self.reach)
+        most = int(counts.max()) if len(counts) else 0
+        for part in counts.nonzero()[:, 0].split(_PAIRS // max(most, 1) + 1):
+            which = part.repeat_interleave(counts[part])  # A Gaussian for each of K pairs. [K]
+            before = (counts[part].cumsum(dim=0) - counts[part]).repeat_interleave(counts[part])  # [K]
+            paths = listed[firsts[which] + torch.arange(len(which), device=which.device) - before]
+            distances = _distances(means[which], self.starts[paths], self.ends[paths])
+            haze[which[(distances < self.reach) & (sizes[which] > HAZE_ANGLE * distances)]] = True
+        found = haze.nonzero()[:, 0]
         ways, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
-        haze = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        haze[found] = torch.from_numpy(ways).to(sizes) > SUPPORT * sizes
+        haze[found] = torch.from_numpy(ways).to(sizes) > SUPPORT * sizes[found].clamp_max(2 * self.reach)
         return haze
 
 
+def _near(positions: Tensor, starts: Tensor, ends: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+    """List the paths [E, 3] that may come within `reach` of positions [N, 3]; there are none of NaN.
+
+    A cube around all paths is halved again and again, without the parts that no path comes so near to. Return how many
+    paths each position has [N], the first of them in the list [N], and the list of paths [K]; int64.
+    """
+    corner = starts.amin(dim=0) - reach
+    side = float((starts.amax(dim=0) + reach - corner).max())
+    smallest, halves = max(reach, side / _CUBES), torch.tensor([-0.5, 0.5], device=starts.device)
+    middles, paths = (corner + side / 2).expand_as(starts), torch.arange(len(starts), device=starts.device)
+    while side > smallest and len(paths) <= _PAIRS // 4:
+        side /= 2
+        middles = (middles[:, None] + side * torch.cartesian_prod(halves, halves, halves)).view(-1, 3)
+        paths = paths.repeat_interleave(8)
+        near = _distances(middles, starts[paths], ends[paths]) <= reach + side  # But for rounding, √3/2 of it would do.
+        middles, paths = middles[near], paths[near]
+    cubes = ((torch.cat([middles, positions]) - corner) / side).nan_to_num(-1.0).clamp(-1, _CUBES).floor().long()
+    cubes = (cubes[:, 0] * (_CUBES + 2) + cubes[:, 1]) * (_CUBES + 2) + cubes[:, 2]
+    (listed, order), places = cubes[: len(paths)].sort(), cubes[len(paths) :]
+    firsts = torch.searchsorted(listed, places)
+    return torch.searchsorted(listed, places, right=True) - firsts, firsts, paths[order]
+
+
 def _distances(positions: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Distances of positions [N, 3] from the nearest of the straight paths [E, 3] each. [N]"""
-    ways = ends - starts  # [E, 3]
+    """Distances of positions from straight paths, all [K, 3]. [K]"""
+    ways, away = ends - starts, positions - starts
     squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
-    least = [positions[:0, 0]]
-    for part in positions.split(max(_PAIRS // len(starts), 1)):
-        away = part[:, None] - starts  # [n, E, 3]
-        along = ((away * ways).sum(dim=2) / squares).clamp(0, 1)
-        least.append(torch.addcmul(away, along[..., None], ways, value=-1).norm(dim=2).amin(dim=1))
-    return torch.cat(least)
+    along = ((away * ways).sum(dim=1) / squares).clamp(0, 1)
+    return torch.addcmul(away, along[:, None], ways, value=-1).norm(dim=1)

@@ -152,7 +152,7 @@ def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
     torch.save(started.get_extra_state(), tmp_path / "state")
     paths = started.strategy_state.pop("camera_paths")
     started.set_extra_state(torch.load(tmp_path / "state", weights_only=True))
-    assert len(paths.points) > 0 and paths.near.any()
+    assert len(paths.points) > 0
     for name, value in vars(paths).items():
         torch.testing.assert_close(getattr(started.strategy_state["camera_paths"], name), value, rtol=0, atol=0)
 
