@@ -322,12 +322,14 @@ class PhotosToSplat:
 
     def _export(self, line: StatusLine) -> str:
         checkpoint, jobs, told = self._checkpoint(), [], []
-        for name in self._formats:
-            output = self.folder / f"splat.{name}"
+        outputs = {name: self.folder / f"splat.{name}" for name in (*self._formats, *_FORMATS)}
+        for name, output in outputs.items():
             if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
-                told.append(f"{output}; done before")
-            else:  # The folder may have been renamed since the run's config.yml noted where the scene is.
+                told += [f"{output}; done before"] if name in self._formats else []
+            elif name in self._formats:  # The folder may have been renamed since config.yml noted where the scene is.
                 jobs.append(Export(self._run, output, data=self._data))
+            elif output.is_file():
+                line.print(f"{output} is of an earlier splat: delete it, or make it anew with --formats {name}.")
 
         def on_event(event: str, output: str) -> None:
             if event == "export begins":

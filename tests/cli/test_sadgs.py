@@ -414,6 +414,22 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
     assert main(arguments) == 0 and commands[0][0] == "ns-train"
 
 
+@pytest.mark.hard_case(
+    "files of an earlier splat in formats that the command does not ask for again", "a line names each of them"
+)
+def test_files_of_an_earlier_splat_are_told(
+    scene: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    command, out = [str(scene), "-o", str(tmp_path / "out"), "--formats"], tmp_path / "out"
+    assert main([*command, "spz,ply"]) == 0 and main([*command, "ply"]) == 0
+    assert "is of an earlier splat" not in capsys.readouterr().out
+    for path in (out / "splat.spz", out / "splat.ply"):
+        os.utime(path, (0, 0))
+    assert main([*command, "ply"]) == 0 and main([*command, "ply"]) == 0
+    told = f"{out}/splat.spz is of an earlier splat: delete it, or make it anew with --formats spz.\n"
+    assert capsys.readouterr().out.count(told) == 2 and commands[-1][0] == "sadgs-export" and len(commands) == 4
+
+
 def test_a_run_is_not_that_of_cameras_that_were_found_after_it(
     photos: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
 ):
