@@ -87,6 +87,21 @@ def test_the_command_is_installed_under_its_name():
     assert getattr(importlib.import_module(entry[0]), entry[1]) is doctor.main
 
 
+@pytest.mark.hard_case("`sadgs-doctor` on a run, its folder or config.yml", "says so, and what shows and exports it")
+@pytest.mark.parametrize("given", ["", "config.yml"])
+def test_a_run_is_told_from_a_capture(given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    run = tmp_path / "a run"
+    (run / "nerfstudio_models").mkdir(parents=True)
+    (run / "config.yml").touch()
+    assert doctor.main([str(run / given)]) == 1
+    assert "is a run" not in capsys.readouterr().out
+    (run / "nerfstudio_models" / "step-000000007.ckpt").touch()
+    assert doctor.main([str(run / given)]) == 1
+    config = f"'{run}/config.yml'"
+    shown = f"`ns-viewer --load-config {config}` shows it, and `sadgs-export {config} --output splat.ply` exports it."
+    assert capsys.readouterr().out.splitlines()[-1] == f"error: {run / given} is a run and no capture: {shown}"
+
+
 @pytest.mark.parametrize(("severity", "code"), [("note", 0), ("warning", 0), ("error", 1)])
 def test_only_an_error_makes_the_exit_code_1(
     severity: Any, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -139,6 +139,19 @@ def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
     assert said.endswith("mixes the camera models OPENCV and OPENCV_FISHEYE: keep the frames of one of them.")
 
 
+@pytest.mark.hard_case("a `mask_path` with backslashes, as of Windows, or without a suffix", "read")
+@pytest.mark.parametrize("name", [r"masks\0.png", "masks/0"])
+def test_names_of_masks_are_mended_as_those_of_images(name: str, write: Callable[..., Path]):
+    data = write(of_frame=lambda frame: frame.update(mask_path=name))
+    (data / "masks").mkdir()
+    Image.new("L", (WIDTH, HEIGHT), 255).save(data / "masks" / "0.png")
+    (told,) = [finding.sentence for finding in check_data(data) if finding.sentence.endswith(" masks.")]
+    assert re.search(r" with (\d+) masks\.$", told)
+    config = NerfstudioDataParserConfig(data=data)
+    config._target = TransformsParser
+    assert {*config.setup().get_dataparser_outputs().mask_filenames} == {data / "masks" / "0.png"}
+
+
 @pytest.mark.hard_case(
     "a Blender scene whose names end in .png, or without a file of validation", "read; the names became `.png.png`"
 )
@@ -224,3 +237,36 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
     for name, value in options.items():
         assert getattr(command, name).name == value
     assert poses_elsewhere(data) == said and poses_elsewhere(tmp_path / "out") is None
+
+
+@pytest.mark.hard_case(
+    "poses of OpenSfM, Meshroom or Bundler",
+    "the command that makes a COLMAP model of them is named, which is then read",
+)
+@pytest.mark.parametrize(
+    ("file", "content", "command"),
+    [
+        (
+            "reconstruction.json",
+            '[{"shots": {}}]',
+            "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse",
+        ),
+        ("cameras.sfm", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
+        ("sfm.json", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
+        (
+            "bundle.out",
+            "# Bundle file v0.3\n",
+            "kapture_import_bundler.py -i {file} -l LIST.txt -im {data}/images --add-reconstruction -o KAPTURE && "
+            "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse",
+        ),
+    ],
+)
+def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
+    file: str, content: str, command: str, captures: Path, tmp_path: Path
+):
+    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    (tmp_path / file).write_text("")
+    assert poses_elsewhere(tmp_path) is None
+    (tmp_path / file).write_text(content)
+    named = command.format(data=tmp_path, file=tmp_path / file)
+    assert errors(tmp_path) == [f"{tmp_path / file} has poses: `{named}` keeps them."] == [poses_elsewhere(tmp_path)]

@@ -172,10 +172,6 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
 
 def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return wxyz quaternions [V, 4] as matrices [V, 3, 3]; scipy would take half a second to import."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
+    quats = quats[:, None] / np.linalg.norm(quats, axis=1)[:, None, None]  # [V, 1, 4]
+    cross = np.cross(np.eye(3), quats[..., 1:])  # The matrix of the cross product with the axis. [V, 3, 3]
+    return np.eye(3) + 2 * (quats[..., :1] * cross + cross @ cross)  # Rodrigues' formula

@@ -17,16 +17,23 @@ from sadgs_ns.errors import InputError
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
 """Folders in which a reconstruction is looked for; nerfstudio's default is the first."""
+_BUNDLER = (
+    "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
+    "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse"
+)
 _EXPORTS = {
-    "*.xml": (b"<chunk", "metashape --data {photos} --xml {file}"),
-    "*.psx": (b"", "metashape --data {photos} --xml EXPORTED.xml"),
-    "*.csv": (b"#name,", "realitycapture --data {photos} --csv {file}"),
-    "*.xmp": (b"xcr:Rotation", "realitycapture --data {photos} --csv EXPORTED.csv"),
-    "odm_report/shots.geojson": (b"", "odm --data {data}"),
-    "keyframes/cameras/*.json": (b"", "polycam --data {data}"),
-    "metadata.json": (b'"poses"', "record3d --data {data}"),
+    "*.xml": (b"<chunk", "ns-process-data metashape --data {photos} --xml {file} --output-dir FOLDER"),
+    "*.psx": (b"", "ns-process-data metashape --data {photos} --xml EXPORTED.xml --output-dir FOLDER"),
+    "*.csv": (b"#name,", "ns-process-data realitycapture --data {photos} --csv {file} --output-dir FOLDER"),
+    "*.xmp": (b"xcr:Rotation", "ns-process-data realitycapture --data {photos} --csv EXPORTED.csv --output-dir FOLDER"),
+    "odm_report/shots.geojson": (b"", "ns-process-data odm --data {data} --output-dir FOLDER"),
+    "keyframes/cameras/*.json": (b"", "ns-process-data polycam --data {data} --output-dir FOLDER"),
+    "metadata.json": (b'"poses"', "ns-process-data record3d --data {data} --output-dir FOLDER"),
+    "reconstruction.json": (b'"shots"', "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse"),
+    "*sfm*": (b'"poses"', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
+    "bundle.out": (b"# Bundle", _BUNDLER),
 }
-"""Files with other programs' poses, a part of their content, and the command of `ns-process-data` that reads them."""
+"""Files with other programs' poses, a part of their content, and the command that reads them."""
 GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
 """Remedy where poses are missing, as the end of a sentence."""
 
@@ -77,9 +84,8 @@ def _model_folders(data: Path) -> list[Path]:
 def find_cameras(data: Path) -> Path | None:
     """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
     files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
-    if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
-        model = next(iter(models))
-        files = [data / model / f"images.{colmap.model_kind(data / model)}"]
+    if not any(file.is_file() for file in files):
+        files = [data / model / f"images.{colmap.model_kind(data / model)}" for model in find_reconstructions(data)][:1]
     return next((file for file in files if file.is_file()), None)
 
 
@@ -101,22 +107,28 @@ def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
 
 
 def poses_elsewhere(data: Path) -> str | None:
-    """Return the sentence for a folder with another program's poses, which `ns-process-data` reads, or None."""
-    for pattern, (mark, options) in _EXPORTS.items():
+    """Return the sentence for a folder with another program's poses, which a command reads, or None."""
+    for pattern, (mark, command) in _EXPORTS.items():
         if files := [file for file in sorted(data.glob(pattern)) if file.is_file() and mark in file.read_bytes()]:
             photos = next((folder for folder in (data, *sorted(data.glob("*/"))) if images_in(folder)), data)
             named = {"file": files[0], "photos": photos, "data": data}
-            command = options.format(**{name: shlex.quote(str(path)) for name, path in named.items()})
-            return f"{files[0]} has poses: `ns-process-data {command} --output-dir FOLDER` (with ffmpeg) keeps them."
+            command = command.format(**{name: shlex.quote(str(path)) for name, path in named.items()})
+            return f"{files[0]} has poses: `{command}` keeps them."
     return None
 
 
 def no_layout(data: Path) -> str:
     """Return the sentence for a folder without poses."""
-    if not data.exists():
-        return f"{data} does not exist: give --data the folder of a capture."
-    if data.is_file():
-        return f"{data} is a file: give --data the folder of a capture."
+    config = data if data.name == "config.yml" else data / "config.yml"
+    if config.is_file() and any(config.parent.glob("nerfstudio_models/step-*.ckpt")):
+        run = shlex.quote(str(config))
+        shown = f"`ns-viewer --load-config {run}` shows it"
+        return f"{data} is a run and no capture: {shown}, and `sadgs-export {run} --output splat.ply` exports it."
+    if not data.is_dir():
+        return f"{data} {'is a file' if data.exists() else 'does not exist'}: give --data the folder of a capture."
+    if models := find_reconstructions(data):
+        told = f"{data} holds no transforms.json, but {data / next(iter(models))} holds a COLMAP reconstruction"
+        return f"{told}: leave `nerfstudio-data` out of the command."
     around = data.absolute()
     for other in around.parents[:3]:
         inside = around.relative_to(other).parts[0]

@@ -15,7 +15,7 @@ from sadgs_ns.data import IMAGE_SUFFIXES, colmap
 from sadgs_ns.data.checks import geometry
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
 from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, image_size, no_copies, scaled_size
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, find_reconstructions, no_layout
+from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.data.text import read_text
@@ -23,6 +23,7 @@ from sadgs_ns.errors import InputError, reason
 
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of nerfstudio's coefficients, in the order of its distortion_params."""
+_FILES = ("file_path", "mask_path", "depth_file_path")  # Keys with which a frame names files
 _LENS, _PINHOLE = (*_DISTORTION, "distortion_params"), ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _APPLIED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 """Default of `applied_transform`, the map [3, 4] from COLMAP's world to that of the poses: older ns-process-data's."""
@@ -34,7 +35,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     """Check a `transforms.json`, or the one in a folder, and its images if asked."""
     path = data if data.suffix == ".json" else data / "transforms.json"
     if not path.is_file():
-        raise InputError(_no_transforms(data, path))
+        raise InputError(no_layout(data))
     folder, meta = path.parent, read_transforms(path)
     described, model = meta["frames"], meta.get("camera_model", "OPENCV")
     if model not in (known := (*_PERSPECTIVE, "OPENCV_FISHEYE", "FISHEYE624")):
@@ -70,13 +71,6 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
         yield from _check_ply(meta, path, views if sound else [])
-
-
-def _no_transforms(data: Path, path: Path) -> str:
-    if models := find_reconstructions(data):
-        problem = f"{path} does not exist, but {data / next(iter(models))} holds a COLMAP reconstruction"
-        return f"{problem}: leave `nerfstudio-data` out of the command."
-    return no_layout(data) if data.suffix != ".json" else f"{path} does not exist: {GIVE_POSES}."
 
 
 @collect_findings
@@ -129,13 +123,12 @@ def read_transforms(path: Path) -> dict[str, Any]:
 
 
 def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[str, Any]:
-    """Return the frame's intrinsics, derived from shared values, angles or the image, and its image's mended name."""
-    where, name = f"{path}: frame {frame['file_path']}", frame["file_path"]
+    """Return the frame's intrinsics, derived from shared values, angles or the image, and its files' mended names."""
+    where = f"{path}: frame {frame['file_path']}"
+    files = {n: mended_name(path.parent, frame[n]) for n in _FILES if n in frame}
     has_focal = not frame.keys().isdisjoint(("fl_x", "camera_angle_x"))  # Then no shared one is of this frame.
     values = {n: meta[n] for n in meta if not (has_focal and n.startswith(("fl_", "camera_angle_")))} | frame
-    names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
-    name = next((found for found in names if (path.parent / found).is_file()), name)
-    if not values.keys() >= {"w", "h"} and any(size := image_size(path.parent / name)):
+    if not values.keys() >= {"w", "h"} and any(size := image_size(path.parent / files["file_path"])):
         values = {"w": size[0], "h": size[1], **values}
     for side, focal, center, angle in (("w", "fl_x", "cx", "camera_angle_x"), ("h", "fl_y", "cy", "camera_angle_y")):
         if side in values:
@@ -146,7 +139,13 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
         values.setdefault("fl_y", values["fl_x"])
     lens = frame if any(name in frame for name in _LENS) else meta
     taken = {n: values[n] for n in _PINHOLE if n in values} | {n: lens[n] for n in _LENS if n in lens}
-    return {**taken, "file_path": name}
+    return taken | files
+
+
+def mended_name(folder: Path, name: str) -> str:
+    """Return the name of a file in a folder that lacks its suffix or was written with backslashes, as it is there."""
+    names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
+    return next((found for found in names if (folder / found).is_file()), name)
 
 
 def _focal_length(values: dict[str, Any], side: float, angle: str, where: str) -> float:
@@ -220,7 +219,7 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
             raise InputError(f"{where} has NaN or infinity in its pose: remove the frame, or compute the poses again.")
         if np.abs(pose[3] - [0, 0, 0, 1]).max() > 1e-6:
             raise InputError(f"{where} has a last row in its pose that is not 0 0 0 1: transpose it, or correct it.")
-        for name in ("file_path", "mask_path", "depth_file_path"):
+        for name in _FILES:
             if not isinstance(value := frame.get(name, ""), str) or "\0" in value:
                 raise InputError(f"{path}: frame {number} has a {name} that no file can have: correct or remove it.")
     return frames
