@@ -24,7 +24,8 @@ import tyro
 from rich.console import Console
 
 from sadgs_ns.cli.cameras.command import Process, Scene, check_size
-from sadgs_ns.cli.cameras.folder import image_checksum
+from sadgs_ns.cli.cameras.folder import images_of
+from sadgs_ns.cli.cameras.photos import changes_of, photo_stamps
 from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
@@ -89,6 +90,7 @@ class PhotosToSplat:
         self._camera_file = _cameras_of(options, train_options)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
+        self._capture = self.source if source.is_dir() else self.source.parent
         self._settings: dict[str, Any] = {}
         self.timeline = Timeline()
         self._exporter: Worker | None = None
@@ -117,18 +119,21 @@ class PhotosToSplat:
         asked = {"source": os.path.realpath(self.source), "--cameras": "new", "--max-size": options.max_size}
         if self._camera_file:
             asked["--cameras"] = f"{self._camera_file} (checksum {zlib.crc32(self._camera_file.read_bytes()):08x})"
-            asked["images"] = image_checksum(self._camera_file, self.source)
         asked |= {"--effort": options.effort, "options of ns-train": list(self.train_options)}
         self._settings = begun = read_settings(folder / "settings.json", folder)
         if not begun and (folder.is_file() or (folder.is_dir() and any(folder.iterdir()))):
             raise InputError(f"{folder} exists and is not a folder that sadgs began; give another --output.")
         decided = ["source", "--cameras"] if begun else []
         decided += ["--max-size"] if (self._scene / "transforms.json").exists() else []
-        trained = [name for name in ("images", "--effort", "options of ns-train") if name in asked]
-        decided += trained if self._checkpoint() else []
-        if differing := [name for name in decided if begun.get(name) != asked[name]]:
-            told = "; ".join(f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing)
-            raise InputError(f"{folder} was begun with other settings ({told}); give another --output or delete it.")
+        decided += ["--effort", "options of ns-train"] if self._checkpoint() else []
+        differing = [name for name in decided if begun.get(name) != asked[name]]
+        told = [f"{name} was {_shown(begun.get(name))}, is {_shown(asked[name])}" for name in differing]
+        if self._camera_file and self._checkpoint():
+            changes = changes_of(self._capture, begun.get("files", {}), images_of(self._camera_file, self._capture))
+            told += [f"images {change}" for change in changes.values()]
+        if told:
+            begun_as = f"{folder} was begun with other settings ({'; '.join(told)})"
+            raise InputError(f"{begun_as}; give another --output or delete it.")
         self._settings = begun | asked
 
     def _note(self, **settings: Any) -> None:
@@ -306,6 +311,8 @@ class PhotosToSplat:
         begun = bool(self._checkpoint())
         self._note(trained=None)  # The folder of an earlier run may have been deleted.
         line.update("going on" if begun else "starting")
+        if self._camera_file and not begun:
+            self._note(files=photo_stamps(self._capture, images_of(self._camera_file, self._capture)))
         command = ["ns-train", "sadgs", "--data", os.path.abspath(self._data)]
         command += ["--output-dir", str(self.folder.absolute()), "--experiment-name", "training"]
         measures = any(re.match("--steps[-_]per[-_]eval", option) for option in self.train_options)

@@ -43,7 +43,7 @@ from sadgs_ns.cli.cameras.colmap import make_model, start_colmap
 from sadgs_ns.cli.cameras.command import Process, Scene, main, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
 from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
-from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching, pairs_to_match
+from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
 from sadgs_ns.cli.worker import Worker
@@ -130,6 +130,9 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(out, summary, stages, exit_code, printed.read_text(), left, matches)
 
 
+@pytest.mark.hard_case(
+    "how much work `sadgs-process` has", "every stage has a bar with its total, undistortion and frames, too"
+)
 @pytest.mark.hard_case(
     "SIGTERM, SIGHUP or Ctrl-C in `sadgs-process`",
     'ends in 0.5 s with "stopped; run the same command again to resume.", exit code 143, 129 or 130; half-written '
@@ -695,16 +698,6 @@ def test_pairs_of_photos_are_chosen_by_their_number(asked: Matching, photos: int
 
 
 @pytest.mark.hard_case(
-    "how much work `sadgs-process` has", "a line says; every stage has a bar, undistortion and frames, too"
-)
-def test_the_pairs_to_match_are_counted():
-    assert pairs_to_match(10, "exhaustive") == 45
-    assert pairs_to_match(300, "sequential") == 4800
-    assert pairs_to_match(300, "exhaustive") == 44_850
-    assert pairs_to_match(300, "exhaustive", known=299) == 299
-
-
-@pytest.mark.hard_case(
     "EXIF with a focal length or a GPS position of 0/0, and without one",
     "count as unknown: the photos are of one camera",
 )
@@ -1202,7 +1195,7 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
         assert json.loads((out / "transforms.json").read_text()) == before and model.is_dir()
         assert main([str(source), str(out), "--max-size", "120"]) == 0
     printed = capsys.readouterr().out
-    assert "3 photos added to 7.\n3 photos, up to 24 pairs to match." in printed
+    assert "3 photos added to 7.\n" in printed
     assert f"{VIEWS} of {VIEWS} photos registered" in printed
     described = json.loads((out / "transforms.json").read_text())
     frames = {frame["file_path"]: frame for frame in described["frames"]}
@@ -1265,6 +1258,33 @@ def test_photos_are_added_only_where_the_others_are_as_they_were(grown: tuple[Pa
     told = "(photos changed: 1, such as 01.png; photos removed: 1, such as 06.png); put these photos back, give another"
     assert told in capsys.readouterr().err
     assert json.loads((out / "transforms.json").read_text()) == before
+
+
+@pytest.mark.hard_case(
+    "a mask of a finished scene replaced by one of its name and size, added or removed; the same mask at another time",
+    "refused, as a photo is; the same bytes are no change; photos may be added with their masks",
+)
+def test_other_masks_make_another_scene(tmp_path: Path, registered: Callable[[int], None], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png", "masks/a.png")
+    mask, command = photos / "masks" / "a.png", [str(photos), str(tmp_path / "out")]
+    registered(9)
+    assert main(command) == 0
+    (tmp_path / "out" / "transforms.json").write_text("{}")
+    content = mask.read_bytes()
+    os.utime(mask, (0, 0))
+    assert main(command) == 0
+    mask.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    capsys.readouterr()
+    assert main(command) == 2
+    assert "(photos changed: 1, such as masks/a.png); put these photos back, give another" in capsys.readouterr().err
+    mask.rename(mask.with_name("b.png"))
+    assert main(command) == 2
+    changes = "photos added: 1, such as masks/b.png; photos removed: 1, such as masks/a.png"
+    assert f"({changes}); put these photos back, give another" in capsys.readouterr().err
+    mask.with_name("b.png").unlink()
+    mask.write_bytes(content)
+    black(photos, "d.png", "masks/d.png")
+    assert Scene(Process(photos, tmp_path / "out")).added == 1
 
 
 @pytest.mark.hard_case(

@@ -21,6 +21,7 @@ from processes import HANGS
 from rich.console import Console
 from room import draw_photos
 from runs import nerfstudio_data
+from scenes import HEIGHT, WIDTH
 
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.cameras.plan import Summary
@@ -461,7 +462,7 @@ def test_the_process_that_exports_starts_while_training_runs(
 @pytest.mark.hard_case(
     "`sadgs FOLDER` where the folder brings a COLMAP model, or one among its images, or `transforms.json`, or is one",
     "its cameras are used and named; `--cameras new` finds others; nothing is written there; warnings of it, such as "
-    "that of masks that are not used, are printed; other images there are another run",
+    "that of masks that are not used, are printed; other images or masks there are another run, also of the same size",
 )
 @pytest.mark.parametrize("layout", ["sparse/0", "beside", "transforms.json", "file"])
 def test_cameras_that_a_folder_brings_are_used(
@@ -480,6 +481,13 @@ def test_cameras_that_a_folder_brings_are_used(
     elif layout != "sparse/0":
         shutil.rmtree(source / "images")
         nerfstudio_data(source)
+    mask = source / "masks" / "000.png"
+    mask.parent.mkdir()
+    Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
+    if (transforms := source / "transforms.json").exists():
+        described = json.loads(transforms.read_text())
+        described["frames"] = [frame | {"mask_path": r"masks\000.png"} for frame in described["frames"]]
+        transforms.write_text(json.dumps(described))
     given = source / "transforms.json" if layout == "file" else source
     before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
     command = [str(given), "-o", str(tmp_path / "out"), "--formats", "ply"]
@@ -502,12 +510,16 @@ def test_cameras_that_a_folder_brings_are_used(
     rendering = Path(shutil.copy(image := min((source / "images").iterdir()), source / "renders"))
     assert main(command) == 0, "a rendering of the run is no image of the capture"
     shutil.rmtree(rendering.parent)
-    whole = image.read_bytes()
-    image.write_bytes(whole + b" ")
-    assert main(command) == 2
-    said = re.escape(f"{tmp_path}/out was begun with other settings (images was ") + r"\d+ \(checksum \w+\), is \d+ \(c"
-    assert re.search(said, capsys.readouterr().err)
-    image.write_bytes(whole)
+    for path in before:
+        os.utime(path, (0, 0))
+    assert main(command) == 0 and len(commands) == 2, "a copy of the capture is no other capture"
+    for path in (mask, image):
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-1] + b" ")  # of the same size
+        assert main(command) == 2
+        told = f"(images changed: 1, such as {path.relative_to(source)}); give another --output or delete it."
+        assert f"{tmp_path}/out was begun with other settings {told}" in capsys.readouterr().err
+        path.write_bytes(whole)
     (source / used).write_bytes((source / used).read_bytes() + b" ")
     assert main(command) == 2
     assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err

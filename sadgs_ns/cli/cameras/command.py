@@ -28,7 +28,7 @@ from sadgs_ns.cli.cameras.folder import find_source, find_videos
 from sadgs_ns.cli.cameras.panoramas import VIEWS
 from sadgs_ns.cli.cameras.photos import (
     Photo,
-    changed_photos,
+    changes_of,
     convert_photos,
     empty_folder,
     photo_stamps,
@@ -38,7 +38,7 @@ from sadgs_ns.cli.cameras.photos import (
     write_alpha,
     write_masks,
 )
-from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching, pairs_to_match
+from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching
 from sadgs_ns.cli.cameras.video import video_frames, write_frames
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.data.checks.layouts import poses_elsewhere
@@ -104,14 +104,13 @@ class Scene:
         told, back, kind, names = [], "", "videos" if self.is_video else "photos", ["source"]
         source = self.options.source
         if self.begun.get("source") == asked["source"]:  # With another source all the rest differs, too.
-            before, now = {*self.begun.get("photos", [])}, {*asked["photos"]}
-            changes = {
-                "changed": {name or source.name for name in changed_photos(source, self.begun.get("files", {}))},
-                "added": set() if self.finished and not self.is_video else now - before,
-                "removed": before - now,
-            }
-            told = [f"{kind} {verb}: {len(those)}, such as {min(those)}" for verb, those in changes.items() if those]
-            back = f"put these {kind} back, " if changes["changed"] or changes["removed"] else ""
+            files = [""] if source.is_file() else asked["photos"]
+            if self.finished and not self.is_video:  # Others may be added, with their masks.
+                files = [name for name in files if name in self.begun["photos"]]
+                files += [self.masks[name] for name in files if name in self.masks]
+            changes = changes_of(source, self.begun.get("files", {}), files)
+            told = [f"{kind} {change}" for change in changes.values()]
+            back = "" if changes.keys() <= {"added"} else f"put these {kind} back, "
             names = [name for name in asked if name != "photos"]
         for name in (name for name in names if self.begun.get(name) != asked[name]):
             option = name if name == "source" else "--" + name.replace("_", "-")
@@ -192,13 +191,15 @@ def _make(scene: Scene, report: Report) -> Summary:
         photos = read_photos(folder, names, report)
         if scene.is_video:
             photos = [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
-        views = [view for photo in photos for view in photo.views]
-        matching = choose_matching(options.matching, len(views), options.source.is_file())
+        views = sum(len(photo.views) for photo in photos)
+        matching = choose_matching(options.matching, views, options.source.is_file())
         if not scene.is_video:
             stamps = scene.begun.get("files", {})
             scene.settings["files"] = stamps | photo_stamps(folder, [name for name in names if name not in stamps])
             alone.enter_context(scene.alone())  # Only now, when the photos are known to be readable.
-        _tell_work(scene, photos, matching)
+            masks = [name for name in scene.masks.values() if name not in stamps]
+            scene.settings["files"] |= photo_stamps(folder, masks)  # They are noted when the scene is finished.
+        _tell_work(scene, photos)
         if scene.added:  # An interrupted run may have made these without some of them.
             for path in (scene.model, work / "photos"):
                 shutil.rmtree(path, ignore_errors=True)
@@ -217,10 +218,9 @@ def _make(scene: Scene, report: Report) -> Summary:
     return summary
 
 
-def _tell_work(scene: Scene, photos: Sequence[Photo], matching: Matching) -> None:
-    before = {*scene.begun["photos"]} if scene.added else set()
+def _tell_work(scene: Scene, photos: Sequence[Photo]) -> None:
     if scene.added:
-        added = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(before)}"
+        added = f"{scene.added} photo{'s' * (scene.added > 1)} added to {len(scene.begun['photos'])}"
         _say("added", f"{added}.", photos=added)
     if panoramas := sum(photo.is_panorama for photo in photos):
         held_out = "all those of a panorama" if len(photos) > 4 else "single ones"
@@ -229,10 +229,6 @@ def _tell_work(scene: Scene, photos: Sequence[Photo], matching: Matching) -> Non
             f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
             f"leave out 30° about the zenith and the nadir; {held_out} are held out.",
         )
-    views = sum(len(photo.views) for photo in photos)
-    known = sum(len(photo.views) for photo in photos if photo.name in before)
-    pairs = pairs_to_match(views, matching, known)
-    _say("planned", f"{views - known} photos, up to {pairs:,} pairs to match.")
 
 
 def _convert(scene: Scene, folder: Path, stored: Sequence[Photo]) -> tuple[Path, list[Photo]]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import filecmp
-import json
 import math
 import os
 import re
-import zlib
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -18,7 +16,9 @@ from PIL import Image, ImageOps
 
 from sadgs_ns.cli.program import read_settings
 from sadgs_ns.data import IMAGE_SUFFIXES
+from sadgs_ns.data.checks.colmap import automatic_options
 from sadgs_ns.data.checks.images import image_size
+from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
@@ -81,24 +81,20 @@ def _visible_files(folder: Path) -> list[str]:
     return [name for name in names if "/." not in f"/{name}"]
 
 
-def image_checksum(cameras: Path, source: Path) -> str:
-    """Return the number of a capture's images and masks, with a checksum of their names and sizes in bytes.
+def images_of(cameras: Path, folder: Path) -> list[str]:
+    """Return the images and masks of a capture that brings its cameras, relative to its folder; raises as `read_json`.
 
-    They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, and in
-    its `images` and `masks`: renderings of a run may lie in other folders.
+    They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, in
+    `masks` and where the model's images are: renderings of a run may lie in other folders.
     """
-    folder = source if source.is_dir() else source.parent
     if cameras.suffix == ".json":
-        try:
-            frames = json.loads(cameras.read_bytes())["frames"]
-            names = [str(frame.get(key)) for frame in frames for key in ("file_path", "mask_path")]
-        except (ValueError, TypeError, KeyError, AttributeError):
-            return "unknown"  # Training tells what is wrong with the file.
+        frames, keys = frames_of(read_json(cameras), cameras), ("file_path", "mask_path")
+        names = [mended_name(folder, frame[key]) for frame in frames for key in keys if key in frame]
     else:
         images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
-        names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in ("", "images", "masks")]
-    sizes = [(folder / name).stat().st_size for name in names if (folder / name).is_file()]
-    return f"{len(sizes)} (checksum {zlib.crc32(repr([names, sizes]).encode()):08x})"
+        tops = ("", "masks", *automatic_options(folder).images_path.parts[:1])
+        names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in tops]
+    return [name for name in dict.fromkeys(names) if (folder / name).is_file()]
 
 
 def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:

@@ -60,12 +60,17 @@ def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
         return dict(zip(names, pool.map(stamp, names), strict=True))
 
 
-def changed_photos(folder: Path, stamps: Mapping[str, Sequence[int]]) -> list[str]:
-    """Return the photos whose content differs from their stamps; those of the same size and time are not read."""
-    there = {name: (folder / name).stat() for name in stamps if (folder / name).exists()}
+def changes_of(folder: Path, stamps: Mapping[str, Sequence[int]], names: Sequence[str]) -> dict[str, str]:
+    """Return what is "changed", "added" or "removed" among these photos since they were stamped, as ends of sentences.
+
+    Those of the same size and time are not read. The same content at another time, as in a copy, is no change.
+    """
+    there = {name: (folder / name).stat() for name in names if name in stamps and (folder / name).exists()}
     touched = [name for name, now in there.items() if [now.st_size, now.st_mtime_ns] != list(stamps[name][:2])]
     now = photo_stamps(folder, touched)
-    return [name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])]
+    changed = {name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])}
+    changes = {"changed": changed, "added": {*names} - stamps.keys(), "removed": stamps.keys() - {*names}}
+    return {verb: f"{verb}: {len(n)}, such as {min(n) or folder.name}" for verb, n in changes.items() if n}
 
 
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
@@ -122,8 +127,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
         least = 512 if width == 2 * height else 0
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
         image.load()
-        is_turned = orientation in NOT_UPRIGHT
-        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_panorama(image, size))
+        return Photo(name, size, camera, has_alpha, is_read, orientation in NOT_UPRIGHT, is_panorama(image, size))
 
 
 def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tuple[Path, list[Photo]]:

@@ -1,4 +1,4 @@
-"""The choice of the pairs of photos to match, and the summary."""
+"""The way in which pairs of photos are chosen, and the summary."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Literal
 
 EXHAUSTIVE_LIMIT = 40  # Most photos for which every pair is matched; twice the photos take four times as long
 NEIGHBORS = 20  # Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)
-_PAIRS_PER_PHOTO = {"sequential": 16, "similar": NEIGHBORS}  # Other photos that each photo is matched with, at most
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 
 
@@ -41,12 +40,3 @@ def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:
     if asked != "auto":
         return asked
     return "sequential" if is_video else "exhaustive" if photos <= EXHAUSTIVE_LIMIT else "similar"
-
-
-def pairs_to_match(photos: int, matching: Matching, known: int = 0) -> int:
-    """Return the largest number of pairs that are matched, without those of the `known` photos alone."""
-
-    def all_pairs(count: int) -> int:
-        return min(count * _PAIRS_PER_PHOTO.get(matching, count), count * (count - 1) // 2)
-
-    return all_pairs(photos) - all_pairs(known)
