@@ -20,8 +20,7 @@ extents along x and y at which alpha falls below 1/255, at most 3.33 standard de
 [C, N]: three standard deviations along the longer axis. Both are in px, and zero where a Gaussian is not drawn. The
 rest of the package, its Triton kernels too, reads both layouts; if a new gsplat has a third, `project` must convert it
 to one of these."""
-NEAR_PLANE = 0.01
-"""Depth in world units from which gsplat 1.4 and 1.5, and most viewers of exported files, draw Gaussians."""
+NEAR_PLANE = 0.01  # Depth in world units from which gsplat 1.4 and 1.5, and most viewers of files, draw Gaussians
 FAR_PLANE = 1e10  # Depth in world units up to which gsplat draws Gaussians
 SCREEN_BLUR = 0.3  # What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²
 

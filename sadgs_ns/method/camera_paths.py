@@ -21,6 +21,8 @@ HAZE_ANGLE = 0.1  # Haze is longer, in standard deviations, than this share of i
 SUPPORT = 2.0  # A Gaussian is of a surface if a point to start from lies within this many of its standard deviations
 NEIGHBOURS = 4  # A path leads from each camera to so many of the others, the nearest that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
+SAME_PLACE = 5e-4  # Share of the reach within which cameras stand in one place, such as the parts of a panorama
+LONGEST = 20.0  # Length of a path, at most, in near planes or in medians of the distance to the nearest of the others
 _CUBES = 2**12  # Cubes along each side of a grid, at most; float32 tells them apart
 _PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
 
@@ -43,15 +45,16 @@ class CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         rotations = viewmats[:, :3, :3].double().cpu()
         centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
+        reach = near_plane * (REACH if len(centres) <= FEW_VIEWS else REACH_OF_MANY)
         distances = torch.cdist(centres, centres)
         unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
-        nearest = distances.masked_fill_(unlike, torch.inf).fill_diagonal_(torch.inf)
+        nearest = distances.masked_fill_(unlike | (distances < SAME_PLACE * reach), torch.inf).fill_diagonal_(torch.inf)
         nearest = nearest.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
+        longest = LONGEST * max(near_plane, float(nearest.values[:, :1].median()))
         first = torch.arange(len(centres))[:, None].expand_as(nearest.indices)
-        pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values.isfinite()].sort(dim=1).values
+        pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values < longest].sort(dim=1).values
         pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
-        reach = near_plane * (REACH if len(centres) <= FEW_VIEWS else REACH_OF_MANY)
         # No other point is near enough to what `haze` looks at.
         return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + 2 * SUPPORT) * reach)[0] > 0])
 

@@ -122,6 +122,24 @@ def test_paths_lead_to_the_nearest_cameras_that_look_in_a_similar_direction():
     assert haze(paths, (12.0, 0.0, 2.5), (11.0, 2.85, 0.0)) == [True, False]
 
 
+@pytest.mark.hard_case("panoramas in parts, several cameras in one place", "paths lead to the other places")
+def test_paths_lead_from_cameras_in_one_place_to_those_in_others():
+    viewmats = row_of_cameras(2, spacing=8.0).repeat_interleave(6, dim=0)
+    assert haze(CameraPaths.of(viewmats, NEAR, wall(8.0)), (4.0, 0.0, 0.5)) == [True]
+
+
+@pytest.mark.hard_case(
+    "two groups of photos far apart, with plain walls between them that have no SfM points", "no path leads through"
+)
+@pytest.mark.parametrize(("distance", "between"), [(30.0, True), (60.0, False)])
+def test_no_path_leads_to_cameras_that_are_far_away(distance: float, between: bool):
+    viewmats = row_of_cameras(3).repeat(2, 1, 1)
+    viewmats[3:, 2, 3] = -distance
+    assert haze(CameraPaths.of(viewmats, NEAR, wall(-8.0)), (2.0, 0.0, distance / 2)) == [between]
+    apart = row_of_cameras(3, spacing=distance)  # Cameras that all stand far apart are neighbours.
+    assert haze(CameraPaths.of(apart, NEAR, wall(-8.0)), (distance / 2, 0.0, 0.5)) == [True]
+
+
 def test_the_space_around_the_paths_of_many_cameras_is_narrower():
     reaches = [CameraPaths.of(row_of_cameras(n), NEAR, wall(8.0)).reach for n in (FEW_VIEWS, FEW_VIEWS + 1)]
     assert reaches == [REACH * NEAR, REACH_OF_MANY * NEAR] and reaches[1] < reaches[0]
