@@ -547,6 +547,8 @@ def test_options_that_name_a_parser_are_taken_at_their_word(
     (words,) = re.findall("end the command with `(-- colmap [^`]*)`", capsys.readouterr().err)
     assert main([*command, *words.split()]) == 0
     assert commands[0][0] == "ns-train" and commands[0][-2:] == ["--load-3D-points", "False"]
+    (source / "transforms.json").write_text("{}")  # This parser does not read it.
+    assert main([str(source), "-o", str(tmp_path / "other"), "--formats", "ply", *words.split()]) == 0
 
 
 @pytest.mark.hard_case(

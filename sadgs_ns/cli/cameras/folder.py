@@ -82,14 +82,16 @@ def _visible_files(folder: Path) -> list[str]:
 
 
 def images_of(cameras: Path, folder: Path) -> list[str]:
-    """Return the images and masks of a capture that brings its cameras, relative to its folder; raises as `read_json`.
+    """Return the images and masks of a capture that brings its cameras, relative to its folder.
 
     They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, in
     `masks` and where the model's images are: renderings of a run may lie in other folders.
     """
+    names, keys = list[str](), ("file_path", "mask_path")
     if cameras.suffix == ".json":
-        frames, keys = frames_of(read_json(cameras), cameras), ("file_path", "mask_path")
-        names = [mended_name(folder, frame[key]) for frame in frames for key in keys if key in frame]
+        with contextlib.suppress(InputError):  # Training tells what is wrong with the file, if it reads that one.
+            frames = frames_of(read_json(cameras), cameras)
+            names = [mended_name(folder, frame[key]) for frame in frames for key in keys if key in frame]
     else:
         images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
         tops = ("", "masks", *automatic_options(folder).images_path.parts[:1])

@@ -23,11 +23,9 @@ class Summary:
     attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.registered} of {self.photos} photos registered, {self.points:,} points, "
-            f"mean reprojection error {self.reprojection_error:.2f} px. {self.attempts}".rstrip()
-        ]
-        return "\n".join(lines + [f"  {name}: {why}" for name, why in sorted(self.left_out.items())])
+        found = f"{self.registered} of {self.photos} photos registered, {self.points:,} points, mean reprojection error"
+        told = f"{found} {self.reprojection_error:.2f} px. {self.attempts}".rstrip()
+        return "\n".join([told, *(f"  {name}: {why}" for name, why in sorted(self.left_out.items()))])
 
     @property
     def is_poor(self) -> bool:
