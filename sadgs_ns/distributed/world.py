@@ -13,8 +13,7 @@ from torch import Tensor
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import use_triton
 
-REBALANCED_BEYOND = 1.1
-"""Shards are made equal if the largest has more than this many times the Gaussians of the smallest."""
+REBALANCED_BEYOND = 1.1  # Shards are made equal if the largest has more than this many times the smallest's Gaussians
 _ROWS_AT_ONCE = 1 << 20  # Rows that are gathered at once, so that it takes little of the device's memory
 
 

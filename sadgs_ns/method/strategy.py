@@ -213,7 +213,7 @@ class StructureAwareStrategy(Strategy):
         if iteration == windows.refine_stop_iter:
             if rule is None or rule.reads != "statistics":  # whose step has pruned
                 self._prune_faint(params, optimizers, state, FINAL_PRUNE_OPACITY)
-            for key in (*empty_state(0, torch.device("cpu")), "camera_paths"):
+            for key in empty_state(0, torch.device("cpu")):
                 state.pop(key, None)  # Neither memory nor checkpoints should hold them.
         # A reset just before the final prune would leave nothing that had time to recover.
         elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:

@@ -154,7 +154,7 @@ def test_a_single_camera_or_two_in_one_place_have_a_space_all_the_same(points: i
 
 
 @pytest.mark.parametrize("iteration", [300, 500, 1600], ids=["AbsGS", "structure", "last"])
-def test_densification_steps_prune_haze_and_the_last_one_forgets_the_paths(iteration: int):
+def test_densification_steps_prune_haze_and_the_last_one_keeps_the_paths_for_a_run_that_goes_on(iteration: int):
     strategy = StructureAwareStrategy(reset_every=0, absgs_every=100, structure_every=500)
     means = torch.tensor([[3.0, 0.0, 1.0], [3.0, 0.0, 8.0], [0.0, 0.0, 12.0]])
     params = torch.nn.ParameterDict(
@@ -166,6 +166,6 @@ def test_densification_steps_prune_haze_and_the_last_one_forgets_the_paths(itera
     }
     strategy._clear_statistics(params, state)
     strategy.step_post_backward(params, optimizers, state, iteration - 1, [])
-    assert params["means"].tolist() == means[1:].tolist() and ("camera_paths" in state) == (iteration < 1600)
+    assert params["means"].tolist() == means[1:].tolist() and "camera_paths" in state
     for step in state.get("structure_steps", []):
         assert (step["before"], step["pruned"], step["after"]) == (3, 1, 2)

@@ -146,6 +146,15 @@ def test_the_cameras_paths_are_kept_clear_if_the_options_ask_for_it(asked: bool,
     assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == asked
 
 
+@pytest.mark.hard_case("random points to start from beside SfM points", "these still tell surfaces from haze")
+def test_sfm_points_are_of_surfaces_if_a_run_starts_from_random_ones(config: Any):
+    config.pipeline.model.stereo_points, states = 0, []
+    for config.pipeline.model.random_init in (True, False):
+        states.append(set_up(config).pipeline.model.strategy_state)
+    ours, usual = (state["camera_paths"].points for state in states)
+    assert len(usual) > 0 and (usual[:, None] == ours).all(dim=2).any(dim=1).all()
+
+
 def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
     config.pipeline.model.stereo_points = 0
     started: Any = set_up(config).pipeline.model

@@ -19,8 +19,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
 _FLOAT32_STEP = 2.0**-23  # Distance of a float32 to the next, relative to its size; nerfstudio centres poses in float32
-_FEWEST_STEPS = 1_000
-"""Steps of float32 that the cameras' spread must have at least, so that their positions are not too coarse."""
+_FEWEST_STEPS = 1_000  # Steps of float32 that the cameras' spread must have, so that their positions are not too coarse
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10  # Distance in image sizes at which a principal point is a mistake, and not due to a crop

@@ -21,8 +21,7 @@ from sadgs_ns.data.coordinates import fixed_frame
 from sadgs_ns.data.text import read_text
 from sadgs_ns.errors import InputError, reason
 
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-"""Names of nerfstudio's coefficients, in the order of its distortion_params."""
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's coefficients, in the order of its distortion_params
 _FILES = ("file_path", "mask_path", "depth_file_path")  # Keys with which a frame names files
 _LENS, _PINHOLE = (*_DISTORTION, "distortion_params"), ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _APPLIED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
