@@ -41,8 +41,7 @@ CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
 brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
 NORMALS = "normals"  # Name of an output that is computed only if it is read
-LIMIT_EVERY = 25
-"""Iterations from one limit on scales to the next, in which an axis grows at most threefold at the presets' rates."""
+LIMIT_EVERY = 25  # Iterations between limits on scales, in which an axis grows at most threefold at the presets' rates
 
 
 class SadgsModel(SplatfactoModel):
@@ -87,7 +86,7 @@ class SadgsModel(SplatfactoModel):
         self.strategy_state["scene_scale"] = extent = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
-        keep = camera_distances(self.means.detach(), self.camera_positions) >= radii
+        keep = camera_distances(self.means.detach(), self.camera_positions, radii) >= radii
         if keep.any():
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]

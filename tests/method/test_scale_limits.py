@@ -13,7 +13,8 @@ from sadgs_ns.method.scale_limits import camera_distances, limit_scales
 def test_points_are_clear_of_cameras_from_their_radius_on():
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
-    assert (camera_distances(means, positions) >= torch.tensor([2.0, 2.5, 3.0])).tolist() == [True, False, True]
+    radii = torch.tensor([2.0, 2.5, 3.0])
+    assert (camera_distances(means, positions, radii) >= radii).tolist() == [True, False, True]
 
 
 @pytest.mark.hard_case("cameras and points far from the origin", "distances to cameras are exact")
@@ -24,7 +25,7 @@ def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
     positions = torch.rand((40, 3), generator=generator) + offset
     distances = (means.double()[:, None] - positions.double()).norm(dim=-1).amin(dim=1)  # [5000]
     radii = distances.float() * torch.where(torch.arange(5_000) % 2 == 0, 0.99, 1.01)
-    assert torch.equal(camera_distances(means, positions) >= radii, distances >= radii)
+    assert torch.equal(camera_distances(means, positions, radii) >= radii, distances >= radii)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1_000.0])
@@ -42,6 +43,30 @@ def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: floa
         limit_scales(limited, means, positions, 0.5)
         torch.testing.assert_close(limited.detach().double(), expected, rtol=0, atol=1e-5)
         assert torch.equal(limited.detach()[expected == scales], scales[expected == scales])
+
+
+@pytest.mark.hard_case("thousands of cameras", "only Gaussians near a group of them are compared with each camera")
+@pytest.mark.parametrize("offset", [0.0, 1_000.0])
+@pytest.mark.parametrize("number", [10, 43])
+def test_many_cameras_limit_the_same_axes_to_the_same_length(
+    number: int, offset: float, monkeypatch: pytest.MonkeyPatch
+):
+    generator = torch.Generator().manual_seed(number)
+    positions = torch.rand((number, 3), generator=generator).cumsum(dim=0) + offset
+    means = positions[torch.arange(600) % number] + 5 * torch.randn((600, 3), generator=generator)
+    scales = 2 * torch.randn((600, 3), generator=generator) - 1
+    scales[0], scales[1] = torch.inf, torch.nan
+    each, many = scales.clone(), scales.clone()
+    limit_scales(each, means, positions, 0.5)
+    distances = camera_distances(means, positions, scales.amax(dim=1).exp())
+    monkeypatch.setattr(scale_limits, "MANY_CAMERAS", 10)
+    monkeypatch.setattr(scale_limits, "_GROUP", 4)
+    limit_scales(many, means, positions, 0.5)
+    torch.testing.assert_close(many, each, rtol=0, atol=0, equal_nan=True)
+    radii = torch.rand(600, generator=generator) * 8
+    found = camera_distances(means, positions, radii)
+    assert torch.equal(found >= radii, distances >= radii)
+    assert 100 < int(found.isfinite().sum()) < 500 and torch.equal(found[found.isfinite()], distances[found.isfinite()])
 
 
 def test_a_gaussian_around_a_camera_keeps_a_finite_size():
