@@ -8,8 +8,7 @@ import os
 from contextlib import suppress
 from typing import Any
 
-FILE = "SADGS_EVENTS"
-"""Environment variable with the path of a file, from which a listener reads each event as a line of JSON."""
+FILE = "SADGS_EVENTS"  # Environment variable that names a file, where a listener reads each event as a line of JSON
 
 
 def report(event: str, **fields: Any) -> None:

@@ -19,12 +19,10 @@ from sadgs_ns.errors import InputError, reason
 TriangleMesh = Any
 """`open3d.geometry.TriangleMesh`; open3d cannot be imported everywhere. It has `vertices` in world units [V, 3], their
 `vertex_colors` in [0, 1] [V, 3], and `triangles`, with corners counterclockwise for a camera that sees them [F, 3]."""
-MOST_VOXELS = 60_000_000
-"""Most voxels of a mesh; at the peak, while their number doubles, each takes 71 bytes, 4.3 GB in all."""
+MOST_VOXELS = 60_000_000  # Most voxels of a mesh; while their number doubles, each takes 71 bytes, 4.3 GB in all
 PIXELS_PER_VOXEL = 2.0  # Edge of a voxel if none is given, in pixels of the median depth
 _TRUNCATION = 4.0  # Voxels behind a surface that count as near it; thinner walls have no two sides
-_WIDEST_PIXEL = 4.0
-"""Width in voxels, at their depth, above which pixels are left out, as they are far behind what the views show."""
+_WIDEST_PIXEL = 4.0  # Width in voxels, at their depth, above which pixels are left out: they are far behind the rest
 _RESOLUTION = 16  # Voxels along the edge of a block
 _BLOCKS = 1000  # Blocks with room at first, 82 MB; Open3D doubles that if it must
 _VIEWS = 3  # A surface needs so many views, or all where there are fewer

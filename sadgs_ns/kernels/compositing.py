@@ -29,8 +29,7 @@ from sadgs_ns.kernels.shared import load3, store3
 
 SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial
 _FAINTEST = tl.constexpr(0x3B808081)  # Bits of 1/255
-_GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16
-"""Gaussians of a batch. Forward, 16 take 1.2 times as long, and 32 take 1.5 times."""
+_GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16  # Gaussians of a batch. Forward, 16 take 1.2 times as long, 32 take 1.5 times
 _WARPS = 1  # Warps of a program
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores: three products of the two parts of 11 bits of each factor. "tf32" is

@@ -17,8 +17,7 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, store3
 
 MAX_DEGREE = 3  # Highest degree that the kernels know
-_LANES, _BACKWARD_LANES = 128, 32
-"""Gaussians that one program handles, forward and backward, where each has four threads."""
+_LANES, _BACKWARD_LANES = 128, 32  # Gaussians of one program, forward and backward, where each has four threads
 _VIEWS = 2  # Views whose gradients one launch sums in registers; more views take more launches
 
 

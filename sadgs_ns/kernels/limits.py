@@ -11,8 +11,7 @@ from sadgs_ns.errors import InputError
 MAX_ROWS = (2**31 - 256) // 3
 """Most Gaussians, and most pixels, of all views of a step, and most pixels of an image with a structure tensor:
 rows of three numbers are addressed in 32 bits. A block of 256 numbers that begins below three times this ends there."""
-MAX_PAIRS = 2**31 - 1
-"""Most pairs of a Gaussian and a tile: lists of tiles, here and in gsplat, hold their places in 32 bits."""
+MAX_PAIRS = 2**31 - 1  # Most pairs of a Gaussian and a tile: lists of tiles, here and in gsplat, have places of 32 bits
 MAX_BLOCKS = 2**16 - 1  # Most views, and most images times channels: CUDA launches no more blocks along an axis
 MAX_HEIGHT = 2 * MAX_BLOCKS  # Two rows of an image are a block of `structure_tensor`.
 

@@ -13,8 +13,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
-_SEEN = 1 / 255
-"""Pixels: a view sees a Gaussian that makes up at least this much of its image, the smallest opacity that is drawn."""
+_SEEN = 1 / 255  # Pixels: a view sees a Gaussian that makes up at least this much of its image, the least that is drawn
 
 
 @dataclass(frozen=True)

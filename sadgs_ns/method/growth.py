@@ -20,8 +20,7 @@ from sadgs_ns.method.statistics import consistent
 
 SMALL_SCALE = 0.001
 """Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
-_OTHER_AXES = 0.8
-"""Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md#why-these-defaults)."""
+_OTHER_AXES = 0.8  # Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md)
 
 
 @dataclass(frozen=True)

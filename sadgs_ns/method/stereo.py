@@ -20,12 +20,10 @@ from torch import Tensor
 
 from sadgs_ns.method.near_plane import depths_in_views
 
-WORKING_SIDE = 800
-"""Longest side in px at which depth is computed. Larger images are reduced, since time grows with the area."""
+WORKING_SIDE = 800  # Longest side in px at which depth is computed; larger images are reduced: time grows with the area
 LEVELS = 3  # Levels of the image pyramid. Each has half the sides of the one before
 WINDOW = 5  # Side in px, odd, of the windows that are compared
-SMOOTHING = 5
-"""Side in px, odd, of the box over which scores are averaged, so that pixels without texture follow those beside."""
+SMOOTHING = 5  # Side in px, odd, of the box over which scores are averaged: plain pixels follow their neighbours
 HYPOTHESES = 128  # Most intervals of inverse depth on the coarsest level. Time and memory grow with them
 NEIGHBOURS = 4  # Neighbours per view. Time grows with them; with fewer, occlusions leave holes
 NOISE = 0.004  # Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0

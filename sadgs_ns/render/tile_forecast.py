@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-MARGIN = 1.25
-"""Factor on the prediction, not measured: larger ones sort more unused places, and smaller ones repeat more steps."""
+MARGIN = 1.25  # Factor on the prediction, not measured: larger ones sort unused places, smaller ones repeat more steps
 RECENT = 8  # Number of the latest visits among which the largest change is taken
 MOST_PAIRS = 2**25
 """Longer lists are not foreseen: their unused places would take 200 MB, and beside rendering a wait does not matter."""

@@ -38,8 +38,7 @@ from sadgs_ns.training.options import check_ranges, hide
 from sadgs_ns.training.progress import ProgressTable
 from sadgs_ns.training.run_folder import begin
 
-_MOST_RANDOM = 10_000_000
-"""Largest number of random points to start from; they take the host's memory before the cap thins them out."""
+_MOST_RANDOM = 10_000_000  # Most random points to start from: they take the host's memory before the cap thins them out
 _WIDEST_BLUR = 100  # Largest window of `energy_blur`, which makes kernels of thousands of pixels
 
 

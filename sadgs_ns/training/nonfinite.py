@@ -7,10 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-MAX_GRADIENT = 1e18
-"""Gradients this large count as not finite, because from 1.8e19 their square overflows for good in Adam."""
-DIVERGED_STEPS = 100
-"""Number of steps in a row that were not finite after which a run stops, if its gradients move nothing, too."""
+MAX_GRADIENT = 1e18  # Gradients this large count as not finite: from 1.8e19 their square overflows for good in Adam
+DIVERGED_STEPS = 100  # Steps in a row that were not finite after which a run stops, if its gradients move nothing, too
 
 
 class NonFiniteLog:

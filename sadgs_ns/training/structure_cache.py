@@ -19,8 +19,7 @@ from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.images import stack_masks
 from sadgs_ns.training.views import TrainingViews
 
-PIXELS_PER_BATCH = 4_000_000
-"""Pixels of the images whose structure tensors are computed at once, with about 300 bytes each."""
+PIXELS_PER_BATCH = 4_000_000  # Pixels of the images whose structure tensors are computed at once; each takes 300 bytes
 
 
 class StructureCache:

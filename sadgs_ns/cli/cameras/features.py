@@ -26,8 +26,7 @@ _CONTRAST = 0.02
 """Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
 LISTED, UNLISTED = str.maketrans(" #", "\x1f\x1e"), str.maketrans("\x1f\x1e", " #")  # Stand-ins in names, and back
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
-_AT_ONCE = 256
-"""Photos whose features are kept in memory, at 1 MB each, until COLMAP has read the photos and they are saved."""
+_AT_ONCE = 256  # Photos whose features are kept, at 1 MB each, until COLMAP has read the photos and they are saved
 
 
 def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs: Sequence[Sequence[str]] = ()) -> None:

@@ -32,8 +32,7 @@ from sadgs_ns.events import progress
 if TYPE_CHECKING:
     import torch
 
-_SEED = 0
-"""Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; COLMAP's own seed is the clock."""
+_SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
 _TRIALS = 2000
 """Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs with
 hardly anything in common, and find no more matches in the others."""
