@@ -84,7 +84,8 @@ def _load_torchvision() -> None:
     import torch
 
     spec = importlib.util.find_spec("torchvision")
-    if libraries := [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*")):
+    libraries = [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*"))
+    if libraries:
         torch.ops.load_library(libraries[0])
     else:
         import torchvision  # noqa: F401

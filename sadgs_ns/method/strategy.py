@@ -26,11 +26,11 @@ Infos = Info | Sequence[Info]
 """The info of the views of a step, or a list of those of its views of each size."""
 _WINDOWS = tuple(field.name for field in fields(Windows))
 
-TAU_PRUNE = 0.8  # τ_prune: fraction of observations low on every axis, at which faint Gaussians go (paper, section 3.4)
+TAU_PRUNE = 0.8
+"""τ_prune: fraction of observations that must be low on every axis to prune a faint Gaussian (paper, section 3.4)."""
 PRUNE_OPACITY = 0.1  # τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)
-CLAMP_OPACITY = (
-    0.8  # Structure steps cap opacities at this, so that Gaussians behind get gradients again (released code)
-)
+CLAMP_OPACITY = 0.8
+"""Structure steps lower opacities to at most this, so that Gaussians behind get gradients again (released code)."""
 RESET_FACTOR = 0.1  # Factor of an opacity reset on every opacity (released code)
 FINAL_PRUNE_OPACITY = 0.1  # Opacity under which Gaussians are pruned when densification ends (released code)
 

@@ -22,10 +22,8 @@ from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
 OUTPUT = "cleaned"  # Name of the panel's picture among the viewer's output types
 OFF, STAYS, GOES = "off", "what stays", "what goes"
-NEAREST, FURTHEST = (
-    (-100.0, -100.0, -100.0),
-    (100.0, 100.0, 100.0),
-)  # A box that crops nothing, in world units
+NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
+"""Corners of the box at first, in world units, which crop nothing."""
 
 
 class CleaningPanel(torch.nn.Module):

@@ -84,8 +84,9 @@ def _model_folders(data: Path) -> list[Path]:
 def find_cameras(data: Path) -> Path | None:
     """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
     files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
-    if not any(file.is_file() for file in files):
-        files = [data / model / f"images.{colmap.model_kind(data / model)}" for model in find_reconstructions(data)][:1]
+    if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
+        model = next(iter(models))
+        files = [data / model / f"images.{colmap.model_kind(data / model)}"]
     return next((file for file in files if file.is_file()), None)
 
 
