@@ -346,8 +346,8 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
         "colmap",
         {"colmap_path": "sparse/0", "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 8},
     )
-    job = Job(bonsai, Row("full", "sadgs-indoor"), 0)
-    assert job.key in (Path(__file__).parents[2] / "docs" / "results" / "ablations.jsonl").read_text()
+    job = Job(bonsai, Row("full", "sadgs-paper-indoor"), 0)
+    assert job.key in (Path(__file__).parents[2] / "docs" / "results" / "claims.jsonl").read_text()
 
 
 @pytest.mark.parametrize("wrong", [0, -5, 1.5, "500", True])

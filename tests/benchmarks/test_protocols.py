@@ -132,43 +132,45 @@ def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
     strategy = "pipeline.model.strategy"
     windows = {"structure_every": 500, "absgs_every": 100, "refine_start_iter": 100, "reset_every": 1200}
     longer = {f"{strategy}.{name}": value for name, value in windows.items()}  # as in the preset
-    changes = {
-        "30k iterations": {"max_num_iterations": 30000, **longer},
-        "15k iterations": {"max_num_iterations": 15000, **longer},
-        "full": {},
-        "30k position schedule": {"optimizers.means.scheduler.max_steps": 30000},
-        "no multiview consistency": {f"{strategy}.tau_split": 0.0},
-        "no AbsGS": {f"{strategy}.absgs_every": 0},
-        "no bounding-box points": {"pipeline.model.bounding_box_points": False},
-    }
+    full: dict[str, Any] = {}
+    no_absgs = {f"{strategy}.absgs_every": 0}
     dense = {"pipeline.model.stereo_points": 150_000}
     of_castle = {
-        "AbsGS": {},
-        "no AbsGS": changes["no AbsGS"],
+        "full": full,
+        "no AbsGS": no_absgs,
         "AbsGS, dense start": dense,
-        "no AbsGS, dense start": changes["no AbsGS"] | dense,
+        "no AbsGS, dense start": no_absgs | dense,
     }
-    assert set(built) == {
-        *((scene, label) for scene in ("bonsai", "fox", "south") for label in changes),
-        *(("castle-4", label) for label in of_castle),
+    of_three = {
+        "30k iterations": {"max_num_iterations": 30000, **longer},
+        "15k iterations": {"max_num_iterations": 15000, **longer},
+        "full": full,
+        "30k position schedule": {"optimizers.means.scheduler.max_steps": 30000},
+        "no multiview consistency": {f"{strategy}.tau_split": 0.0},
+        "no structure steps": {f"{strategy}.structure_every": 0},
+        "no AbsGS": no_absgs,
+        "no bounding-box points": {"pipeline.model.bounding_box_points": False},
     }
-    for row in load("ablations").rows:
-        for scene in row.scenes or ():
-            assert row.overrides == (of_castle if scene == "castle-4" else changes)[row.label]
-            indoor = scene in ("bonsai", "fox")
-            assert built[scene, row.label].method_name == ("sadgs-paper-indoor" if indoor else "sadgs-paper")
+    changes = {
+        **{(scene, label): change for scene in ("bonsai", "fox", "south-half") for label, change in of_three.items()},
+        **{("castle-4", label): change for label, change in of_castle.items()},
+        **{(scene, "full"): full for scene in ("castle", "tree")},
+    }
+    ours = [row for row in load("ablations").rows if row.method.startswith("sadgs")]
+    assert {(scene, row.label): row.overrides for row in ours for scene in row.scenes or ()} == changes
+    for scene, label in changes:
+        indoor = scene in ("bonsai", "fox")
+        assert built[scene, label].method_name == ("sadgs-paper-indoor" if indoor else "sadgs-paper")
 
 
-def test_the_progressive_rows_add_one_thing_each(tmp_path: Path):
-    built = configs("progressive", tmp_path)
-    for scene in ("bonsai", "fox", "south"):
-        base, schedule, training, densification, full = (config for (s, _), config in built.items() if s == scene)
-        assert {c.max_num_iterations for c in (base, schedule, training, densification, full)} == {3000}
+def test_the_progressive_ablation_begins_with_splatfacto_and_another_schedule_of_positions(tmp_path: Path):
+    built = configs("ablations", tmp_path)
+    for scene in ("bonsai", "fox", "south-half"):
+        base, schedule = (built[scene, label] for label in ("base", "+ schedule"))
+        assert base.method_name == schedule.method_name == "splatfacto"
+        assert base.max_num_iterations == schedule.max_num_iterations == 3000
         steps = [config.optimizers["means"]["scheduler"].max_steps for config in (base, schedule)]
         assert steps == [30000, 3000]
-        strategies = [config.pipeline.model.strategy for config in (training, densification, full)]
-        assert [s.windows.structure_every for s in strategies] == [0, 500, 500]
-        assert [s.tau_split for s in strategies] == [0.8, 0.0, 0.8]
 
 
 def of_sadgs(name: str, root: Path) -> dict[tuple[str, str], Any]:
@@ -176,9 +178,8 @@ def of_sadgs(name: str, root: Path) -> dict[tuple[str, str], Any]:
     return {key: config for key, config in configs(name, root).items() if config.method_name == "sadgs"}
 
 
-@pytest.mark.parametrize("name", ["ours", "schedule"])
-def test_the_derived_schedule_is_measured_on_all_eight_scenes(name: str, tmp_path: Path):
-    built = of_sadgs(name, tmp_path)
+def test_the_derived_schedule_is_measured_on_all_eight_scenes(tmp_path: Path):
+    built = of_sadgs("ours", tmp_path)
     efforts: dict[str, set[float]] = {}
     for (scene, _), config in built.items():
         assert config.pipeline.model.background_color == ("white" if scene == "lego" else "black")
@@ -190,7 +191,7 @@ def test_the_derived_schedule_is_measured_on_all_eight_scenes(name: str, tmp_pat
 
 
 def test_defaults_are_chosen_on_validation_views_and_the_main_table_is_of_test_views():
-    for name, options in (("schedule", {}), ("ours", {"eval_mode": "interval", "eval_interval": 8})):
+    for name, options in (("defaults", {}), ("ours", {"eval_mode": "interval", "eval_interval": 8})):
         for scene in load(name).scenes.values():
             held_out = {key: value for key, value in scene.options.items() if key.startswith("eval")}
             assert held_out == ({} if scene.name == "lego" else options)

@@ -95,25 +95,27 @@ def test_gradients_equal_float64_autograd(monkeypatch, num_views, names, per_axi
         pytest.skip("gsplat's kernel makes radii in one of the layouts")
     values = scene(num_views)
     inputs: dict[str, Any] = {name: value.clone().requires_grad_() for name, value in values.items()}
-    radii, *others = project_in_torch(**inputs, width=WIDTH, height=HEIGHT)
-    seen = radii > 0
-    assert 0.3 < seen.float().mean() < 0.9
-    ratios = others[0][seen] / torch.tensor([WIDTH, HEIGHT])
-    assert ((ratios < -0.15) | (ratios > 1.15)).any(dim=1).sum() > 5, "the Jacobian should be clamped for some"
-    upstream = upstream_of(seen, names)
-    outputs: dict[str, Any] = dict(zip(OUTPUTS, [*others, 1 * inputs["means"]], strict=True))
-    expected = gradients_of(outputs, inputs, upstream)
+    radii, *in_torch = project_in_torch(**inputs, width=WIDTH, height=HEIGHT)
 
     if DEVICE.type == "cpu":  # gsplat's kernels need CUDA
         monkeypatch.setattr(
             gsplat_compat, "project", lambda *arguments: project_in_torch(*arguments, per_axis_radii=per_axis_radii)
         )
-    inputs = {name: value.float().to(DEVICE) for name, value in values.items()}
+    passed = {name: value.float().to(DEVICE) for name, value in values.items()}
     for name in ("means", "quats", "scales"):
-        inputs[name].requires_grad_()
-    radii, *others = projection.project(**inputs, width=WIDTH, height=HEIGHT)
-    assert not radii.requires_grad and torch.equal(gsplat_compat.drawn(radii, others[0]).cpu(), seen)
-    found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), inputs, upstream)
+        passed[name].requires_grad_()
+    drawn, *others = projection.project(**passed, width=WIDTH, height=HEIGHT)
+    assert not drawn.requires_grad
+    seen = gsplat_compat.drawn(drawn, others[0]).cpu()
+    # gsplat 1.5's kernel lets opacities bound the radii, and its torch code does not.
+    assert (seen != (radii > 0)).float().mean() <= (0.05 if DEVICE.type == "cuda" and per_axis_radii else 0)
+    assert 0.3 < seen.float().mean() < 0.9
+    ratios = in_torch[0][seen] / torch.tensor([WIDTH, HEIGHT])
+    assert ((ratios < -0.15) | (ratios > 1.15)).any(dim=1).sum() > 5, "the Jacobian should be clamped for some"
+    upstream = upstream_of(seen, names)
+    outputs: dict[str, Any] = dict(zip(OUTPUTS, [*in_torch, 1 * inputs["means"]], strict=True))
+    expected = gradients_of(outputs, inputs, upstream)
+    found = gradients_of(dict(zip(OUTPUTS, others, strict=True)), passed, upstream)
     for name, value in expected.items():
         error = float((found[name] - value).norm() / value.norm())
         assert error < 2e-5, (name, error)

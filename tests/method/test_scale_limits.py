@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from gsplat_like import splatted
@@ -95,4 +97,5 @@ def test_a_giant_beside_the_view_covers_all_of_it_until_it_is_limited():
 
     assert opacity().min() > 0.5
     limit_scales(scales, means, torch.zeros((1, 3)), 0.3)
-    assert opacity().max() < 1 / 255  # The camera is now 3.33 standard deviations away.
+    # The camera is now 3.33 standard deviations away, and an edge of its image 3.27; gsplat 1.4 cuts off at 3.
+    assert opacity().max() < 0.97 * math.exp(-(3.26**2) / 2)
