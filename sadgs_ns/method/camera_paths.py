@@ -1,8 +1,8 @@
 """The space along the cameras' paths, which stays empty while a run densifies.
 
-Nothing stands where somebody walked with a camera. Yet a faint Gaussian may float there, which a view from beside it
-shows as haze over the whole image. Viewers of exported files show it, too, since they draw what is nearer than the
-run's near plane. Real surfaces near a path have SfM points.
+Nothing stands where somebody walked with a camera. A faint Gaussian that floats there becomes haze over the whole image
+of a view beside the path. Viewers of exported files show it, too, because they also draw what is nearer than the run's
+near plane. Real surfaces near a path have SfM points.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 REACH = 1.5  # Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md)
-FEW_VIEWS, REACH_OF_MANY = 60, 1.0  # Training views up to which it is this, and with more, where 1.5 cost site .2 dB
+FEW_VIEWS, REACH_OF_MANY = 60, 1.0  # The reach with more than 60 training views is 1; 1.5 would cost site .2 dB
 HAZE_ANGLE = 0.1  # Haze is longer, in standard deviations, than this share of its distance from a path; .2 left some
 SUPPORT = 2.0  # A Gaussian is of a surface if a point to start from lies within this many of its standard deviations
-NEIGHBOURS = 4  # A path leads from each camera to so many of the others, the nearest that look in a similar direction
+NEIGHBOURS = 4  # Each camera has paths to this many others: the nearest ones that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
 SAME_PLACE = 5e-4  # Share of the reach within which cameras stand in one place, such as the parts of a panorama
-LONGEST = 20.0  # Length of a path, at most, in near planes or in medians of the distance to the nearest of the others
+LONGEST = 20.0  # Longest path, in near planes or in medians of the distance from a camera to its nearest neighbour
 _CUBES = 2**12  # Cubes along each side of a grid, at most; float32 tells them apart
 _PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
 
@@ -55,12 +55,12 @@ class CameraPaths:
         pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values < longest].sort(dim=1).values
         pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
-        # No other point is near enough to what `haze` looks at.
+        # `haze` looks at no point farther away.
         return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + 2 * SUPPORT) * reach)[0] > 0])
 
     @cached_property
     def surfaces(self) -> KDTree:
-        """The points, to be searched for the nearest. Comparing all pairs took 40 % of castle's loop on a GPU."""
+        """A search tree of the points. Comparing all pairs took 40 % of castle's loop on a GPU."""
         return KDTree(self.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)  # is built soonest
 
     @torch.no_grad()
@@ -69,7 +69,7 @@ class CameraPaths:
         means: Tensor,  # [N, 3]
         scales: Tensor,  # [N, 3]
     ) -> Tensor:
-        """Tell which Gaussians are haze near a path; those whose centre is not finite are none. bool [N]"""
+        """Tell which Gaussians are haze near a path; one whose centre is not finite is not. bool [N]"""
         haze, sizes = torch.zeros_like(means[:, 0], dtype=torch.bool), scales.amax(dim=1)
         counts, firsts, listed = _near(means, self.starts, self.ends, self.reach)
         most = int(counts.max()) if len(counts) else 0
@@ -86,7 +86,7 @@ class CameraPaths:
 
 
 def _near(positions: Tensor, starts: Tensor, ends: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
-    """List the paths [E, 3] that may come within `reach` of positions [N, 3]; there are none of NaN.
+    """List the paths [E, 3] that may come within `reach` of positions [N, 3]; a position that is NaN has none.
 
     A cube around all paths is halved again and again, without the parts that no path comes so near to. Return how many
     paths each position has [N], the first of them in the list [N], and the list of paths [K]; int64.

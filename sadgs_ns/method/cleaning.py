@@ -1,4 +1,4 @@
-"""Which Gaussians a finished model can do without: those few views see, giants, those outside a box, and dust."""
+"""Find Gaussians that a finished model can do without: those that few views see, giants, dust, those outside a box."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
-_SEEN = 1 / 255  # Pixels: a view sees a Gaussian that makes up at least this much of its image, the least that is drawn
+_SEEN = 1 / 255  # A view sees a Gaussian that makes up at least this part of a pixel, the least that is drawn
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Visibility:
     """How much of N Gaussians the training views see."""
 
     views: Tensor  # Number of views that see each. int64 [N]
-    pixels: Tensor  # How many pixels each makes up in the view where these are most. [N]
+    pixels: Tensor  # Pixels that each makes up in the view where it makes up most. [N]
     total: int  # Number of views
 
 
@@ -68,7 +68,7 @@ def measure_visibility(
     Args:
         params: `means`, `quats`, log `scales`, logit `opacities`.
         cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
-        drawing: How Gaussians are drawn, of whatever colour.
+        drawing: How Gaussians are drawn; their colours do not matter.
     """
     shapes = [params[name].detach() for name in ("means", "quats", "scales")]
     opacities = params["opacities"].detach().flatten().sigmoid()
@@ -94,7 +94,7 @@ def measure_visibility(
 def find_remaining(
     params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None
 ) -> tuple[Tensor, list[str]]:
-    """Find which Gaussians stay. `seen` is needed where `cleaning.needs_views`.
+    """Find which Gaussians stay. `seen` is needed if `cleaning.needs_views`.
 
     Returns:
         Which stay, bool [N]; and for each option that is set a sentence, with how many it takes of what is left.

@@ -1,6 +1,6 @@
-"""A colour matrix for each training view, which takes the exposure and white balance of its photo from the Gaussians.
+"""A colour matrix for each training view, so that the Gaussians need not learn its exposure and white balance.
 
-A gain in linear light is an affine map of sRGB's values, but for the darkest: the matrices can express every exposure.
+A gain in linear light is an affine map of all but the darkest sRGB values, so the matrices can express any exposure.
 3DGS learns such matrices, too (its option `exposure`), of all training views and without an anchor.
 """
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from sadgs_ns.method.stereo import DepthMap
 
-NUMBER = 150_000  # Points that are drawn at most
+NUMBER = 150_000  # Most points that are drawn
 MIN_CONFIDENCE = 0.5  # Confidence of a depth from which its pixel is drawn
-AGREEING_CONFIDENCE = 0.1  # Confidence of a depth from which its view has a say about points
+AGREEING_CONFIDENCE = 0.1  # Confidence from which a depth counts when views are asked whether they agree
 AGREEING_VIEWS = 2  # Views, its own among them, that must agree with a point's depth
 DEPTH_TOLERANCE = 0.02  # Largest relative difference of depths that agree
 SCALE = 0.5  # Largest standard deviation of a point, in wavelengths: its η is 1/2

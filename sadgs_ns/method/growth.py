@@ -20,7 +20,7 @@ from sadgs_ns.method.statistics import consistent
 
 SMALL_SCALE = 0.001
 """Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
-_OTHER_AXES = 0.8  # Of a Gaussian whose longest axis is halved: how long the others stay (docs/results.md)
+_OTHER_AXES = 0.8  # Factor on the other axes of a Gaussian whose longest axis is halved (docs/results.md)
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,8 @@ class Rule:
     """Iterations between its steps inside the densification window; 0 turns it off."""
     propose: Propose
     reads: Literal["statistics", "gradients"] | None = None
-    """The part of the state that its steps read, and that begins anew after each. A rule that reads η's statistics
-    prunes by them before it grows, and gradients begin anew after it, too; others prune the faint after they grew."""
+    """The part of the state that its steps read, and that is emptied after each. A rule that reads η's statistics
+    prunes by them before it grows, and empties the gradients, too; others prune the faint afterwards."""
 
 
 def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:

@@ -10,12 +10,12 @@ _CONTROL_GROUPS = (
     ("memory.max", "memory.current", "memory.stat", "inactive_file"),
     ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat", "total_inactive_file"),
 )
-"""Files of a container's memory below the root of control groups, of their versions 2 and 1: the limit, what is in use,
-and statistics, with the line that tells how much of that are files that the system can forget."""
+"""Files that tell a container's memory, for versions 2 and 1 of control groups: the limit, what is in use, and
+statistics, with the name of the line that counts cached files, which the system can drop."""
 
 
 def available_host_bytes(root: Path = Path("/")) -> float:
-    """Bytes that this process may take, as `proc` and a container's `sys` below `root` tell; else infinity."""
+    """Bytes that this process may take, read from `proc` and a container's `sys` below `root`; infinity if unknown."""
     available = math.inf
     with contextlib.suppress(OSError):
         available = 1024.0 * _numbers(root / "proc/meminfo").get("MemAvailable", math.inf)
@@ -28,6 +28,6 @@ def available_host_bytes(root: Path = Path("/")) -> float:
 
 
 def _numbers(path: Path) -> dict[str, int]:
-    """Return the numbers that a file of the kernel's lists, each behind its name."""
+    """Read the numbers in a file of the kernel whose lines are a name and a number."""
     rows = (line.replace(":", " ").split() for line in path.read_text().splitlines())
     return {row[0]: int(row[1]) for row in rows if len(row) > 1}

@@ -45,7 +45,7 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
 def neighbour_scales(points: Tensor) -> Tensor:
     """The initial scale, > 0, of points [P, 3]: the mean distance to the 3 nearest neighbours (3DGS, splatfacto). [P]
 
-    It is at least a millionth of the cloud's extent, to have a logarithm. Raises ValueError if there is no point.
+    It is at least a millionth of the cloud's extent, so as to have a logarithm. Raises ValueError if there is no point.
     """
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
@@ -59,7 +59,7 @@ def neighbour_scales(points: Tensor) -> Tensor:
 
 
 def plausible_points(points: Tensor) -> Tensor:
-    """Which SfM points [P, 3] to start from: all but those that are not finite or lie absurdly far out. bool [P]"""
+    """Tell which SfM points [P, 3] to start from: all that are finite and not absurdly far out. bool [P]"""
     return ~_far_outliers(points, POINT_SHARE)
 
 

@@ -19,7 +19,7 @@ L2_LAMBDA = 2.0
 
 @lru_cache(maxsize=8)
 def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """SSIM's window on the device, for each channel [3, 1, 1, 11]. A copy of it in every step would stop the host."""
+    """SSIM's window on the device, for each channel [3, 1, 1, 11]. Copying it in every step would stop the host."""
     return torch.tensor(WINDOW, dtype=dtype, device=device).repeat(3, 1, 1, 1)
 
 
@@ -80,7 +80,7 @@ def photometric_part(
     height: int,
     ssim_lambda: float = 0.2,
 ) -> tuple[Tensor, Tensor]:
-    """The share of some rows in a view's `photometric_loss`: over rows that cover the view, the shares sum to it.
+    """The part of a view's `photometric_loss` that some rows contribute; the parts of all rows sum to the loss.
 
     SSIM's windows belong to the rows in which they are centred. Raises ValueError as `photometric_loss`.
 

@@ -1,10 +1,10 @@
-"""How much memory a training step takes on CUDA, and how many Gaussians may be added so that the next one fits.
+"""How much memory a training step takes on CUDA, and how many Gaussians can be added before the next one.
 
 The bytes are counted from the code that allocates them: `render.backend_triton` and gsplat's `fully_fused_projection`,
 `kernels.tiles`, `kernels.losses` and `kernels.compositing`; `tests/benchmarks/test_step.py` measures real peaks.
 
 A step is largest in one of three phases: while the tile lists are sorted, in the loss, and in the backward pass of
-rasterization. What a Gaussian keeps between steps comes on top of each.
+rasterization. The bytes that a Gaussian keeps between steps come on top.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class StepSize:
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
-    """Bytes of the device's memory that this process may have or has already, and all bytes; infinite without CUDA."""
+    """Bytes of the device that are free or already this process's, and all of its bytes; infinite without CUDA."""
     if device.type != "cuda":
         return math.inf, math.inf
     left, total = torch.cuda.mem_get_info(device)
@@ -84,7 +84,7 @@ def available_bytes(device: torch.device) -> tuple[float, float]:
 
 
 def free_bytes(device: torch.device) -> float:
-    """Bytes that new tensors may take, which the driver has left or torch keeps unused; infinite without CUDA."""
+    """Bytes that new tensors may take: free in the driver, or kept unused by torch; infinite without CUDA."""
     available, _ = available_bytes(device)
     return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
 
@@ -96,7 +96,7 @@ def kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
 
 
 def widest_bytes(params: Params) -> int:
-    """Bytes of a Gaussian's widest parameter, which is there twice while a split copies it to its new length."""
+    """Bytes of a Gaussian's widest parameter; while a split copies it to its new length, memory holds it twice."""
     return max(map(_row_bytes, params.values()))
 
 

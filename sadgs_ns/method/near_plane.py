@@ -1,7 +1,7 @@
-"""How near anything is to the cameras: the near plane of a scene.
+"""The near plane of a scene: how near anything comes to the cameras.
 
-A faint Gaussian just before a camera covers the whole image with haze. Training cameras fade those before themselves,
-but not those before a view between them. The photos show nothing that near, so that such Gaussians are not drawn.
+A faint Gaussian just before a camera covers the whole image with haze. Training fades those before the training
+cameras, but not those before a view between them. The photos show nothing that near, so such Gaussians are not drawn.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from torch import Tensor
 
 from sadgs_ns.method.initialization import plausible_points
 
-NEAREST_POINTS = 5  # The depth of a view's fifth SfM point is taken for true; the four that are nearer may be errors
+NEAREST_POINTS = 5  # A view's fifth nearest SfM point is trusted; the four that are nearer may be errors
 NEAR_SHARE = 0.5
 """The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in two of nine sets of
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""
 UNKNOWN_SHARE = 0.01  # The near plane where no view sees enough SfM points, as a share of the cameras' extent
-_MOST_POINTS = 2**17  # Of more points, so many are looked at, since a point in each of thousands of views takes time
+_MOST_POINTS = 2**17  # At most this many points are looked at, because each is projected into every view
 _PAIRS = 2**24  # Pairs of a pose and a point that are computed at a time, in arrays of 64 MB
 
 
@@ -31,7 +31,7 @@ def scene_near_plane(
 ) -> float:
     """Derive the near plane of a scene, > 0, given arguments of `depths_in_views` and `initialization.camera_extent`.
 
-    The training camera that is nearest to anything decides, by the depth of its `NEAREST_POINTS`-th SfM point.
+    The training camera whose `NEAREST_POINTS`-th nearest SfM point has the least depth decides.
     """
     points, nearest = points[plausible_points(points)], math.inf
     if len(points) >= NEAREST_POINTS:

@@ -1,4 +1,4 @@
-"""Changes of parameters together with the moments of their optimizers."""
+"""Change parameters together with the moments of their optimizers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def map_opacities(function: Callable[[Tensor], Tensor], params: Params, optimize
 
 
 def rebalance(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
-    """Count the Gaussians of all processes, and give each equally many where they differ by more than a tenth."""
+    """Count the Gaussians of all processes, and even them out if they differ by more than a tenth."""
     world.count(len(params["means"]))
     if not world.is_uneven():
         return

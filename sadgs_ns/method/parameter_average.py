@@ -1,4 +1,4 @@
-"""The mean of the Gaussians' parameters over the last iterations of a run, which is less noisy than the last ones."""
+"""The mean of the Gaussians' parameters over a run's last iterations, which is less noisy than the last one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sadgs_ns.method.ops import Params
 class RunningMean:
     """The mean of parameters over iterations (Polyak and Juditsky).
 
-    Each step renders few views, so that the parameters keep moving around the best ones for all views; their mean is
+    Each step renders few views, so the parameters keep moving around those that are best for all views; their mean is
     closer. Parameters are averaged as they are optimized, such as log scales and logits of opacities.
     """
 
@@ -26,7 +26,7 @@ class RunningMean:
 
     @torch.no_grad()
     def add(self, params: Params) -> None:
-        """Take an iteration's parameters into the mean, of the same shapes each time."""
+        """Add an iteration's parameters to the mean; their shapes must not change."""
         self.count += 1
         if self.count == 1:
             self.means = {name: parameter.detach().clone() for name, parameter in params.items()}

@@ -1,4 +1,4 @@
-"""How near Gaussians may come to cameras, for their size.
+"""How large Gaussians may be for their distance from the cameras.
 
 EWA splatting is linear around a Gaussian's centre, which fails where it subtends a large angle. Training views may see
 only the tail of a giant beside the field of view, while it covers every pixel of another view.
@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-MANY_CAMERAS = 1024  # From so many on, Gaussians that are far from all cameras of a group are found first
-_GROUP = 64  # Cameras of a group, which are neighbours in the order of their names, mostly
+MANY_CAMERAS = 1024  # From this many on, groups of cameras that are far from a Gaussian are ruled out first
+_GROUP = 64  # Cameras of a group; those that follow each other in the order of names are mostly neighbours
 _PAIRS = 2**22  # Distances from Gaussians to cameras that are computed at a time, in three arrays of 16 MB
 _LEAST_LIMIT = 1e-7  # World units. A Gaussian around a camera's centre keeps this size, so that its logarithm is finite
 
@@ -39,7 +39,7 @@ def camera_distances(
 ) -> Tensor:
     """Return the distance of each point from the nearest camera, in world units. [N]
 
-    Of many cameras it is infinity for points that are farther away than their reach, as boxes around groups tell.
+    With many cameras it is infinity for points that are farther away than their reach from the boxes around all groups.
     """
     if len(positions) < MANY_CAMERAS:
         return _distances(means, positions)

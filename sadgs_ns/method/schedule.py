@@ -1,7 +1,7 @@
 """The length of a run, the views of a step, and the times of densification, derived from the capture.
 
 A *view visit* is one rendering of one training view with its gradients. Many visits to few views overfit, and few
-visits to many underfit, so that the number of visits follows the number of views (docs/results.md#why-these-defaults).
+visits to many views underfit, so it grows with the number of views (docs/results.md#why-these-defaults).
 """
 
 from __future__ import annotations
@@ -11,24 +11,24 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 BASE_VISITS = 2000
-"""View visits of a run whatever the number of views."""
+"""View visits of every run, before those for each view."""
 VISITS_PER_VIEW = 50
 """View visits of a run for each training view."""
 STEPS_BEFORE_VIEWS = 2000
-"""Optimizer steps that a run should have before a step takes a view more."""
+"""Optimizer steps that a run should have before its steps take one more view."""
 MOST_EFFORT = 100
 """Largest `effort`: a million iterations of four views for a capture of 760."""
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
 MORE_VISITS_FROM = (50, 90)
-"""Numbers of views up to which effort above 1 adds no visits, not to overfit, and from which it multiplies them."""
+"""Up to the first number of views, effort above 1 adds no visits; from the second on, it multiplies them."""
 GROWTH_WITH_EFFORT = (-0.32, 0.8)
 """Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.8."""
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
-"""Iterations of the shortest run that resets opacities: shorter ones lost 2.7 to 11 dB (docs/results.md)."""
-_PARTS = 30  # A run is divided into so many parts of as many whole iterations
+"""Shortest run that resets opacities, in iterations: a reset cost shorter ones 2.7 to 11 dB (docs/results.md)."""
+_PARTS = 30  # A run is divided into this many parts of equal length, in whole iterations
 _WINDOWS = {
     "structure_every": 5,
     "absgs_every": 1,
@@ -68,7 +68,7 @@ def schedule(
     """Derive the length of a run from the number of its training views, at least 1; given numbers stay.
 
     With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
-    multiplies it if views are many (`MORE_VISITS_FROM`). A step takes a view more for every 2,000 visits, up to four.
+    multiplies it if views are many (`MORE_VISITS_FROM`). A step takes one more view for every 2,000 visits, up to four.
     """
     few, many = MORE_VISITS_FROM
     power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
@@ -100,12 +100,12 @@ def windows(iterations: int, **given: int | None) -> Windows:
 
 
 def due(iteration: int, every: int) -> bool:
-    """Whether something that comes every so many iterations comes at this one; 0 is never."""
+    """Tell whether something that happens every `every` iterations happens at this one; 0 is never."""
     return every > 0 and iteration % every == 0
 
 
 def next_due(iteration: int, every: int) -> float:
-    """The first iteration from this one on at which it is `due`; infinity if never."""
+    """Return the first iteration, from this one on, at which it is `due`; infinity if never."""
     return -(-iteration // every) * every if every > 0 else math.inf
 
 

@@ -21,7 +21,7 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
 def keep_gradient(
     means2d: Tensor,  # [C, N, 2]
 ) -> None:
-    """Have the backward pass keep the gradient of projected centres, from a call with `absgrad`.
+    """Let the backward pass keep the gradient of projected centres, given `info` of a call with `absgrad`.
 
     Our compositing keeps it by itself, without the copy that torch makes.
     """

@@ -60,7 +60,7 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
 
     μ_child = μ + R (s ⊙ g) and s_child = s ⊘ n (paper, eq. 9); rotation, colour and opacity are copied. The order
     afterwards is [unsplit, children grouped by parent]. Children start with zero optimizer moments and empty rows of
-    every tensor in `state`: observations of the parent, which was longer, do not hold for them.
+    every tensor in `state`: the parent was longer, so its observations do not hold for them.
 
     Children k times as large (not in the paper) fill the gaps between them: their grid is narrower, so that the
     covariance stays, and their opacity 1/k for each axis that is split, so that the integral of opacity stays.
@@ -78,7 +78,7 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
     parents = selected[local_parents]  # [Q]
     n = counts[parents].to(params["scales"].dtype)  # [Q, 3]
     is_axis_split = n > 1  # [Q, 3]
-    # An axis that is not split has one cell, in the middle: any factor does.
+    # An axis that is not split has one cell in the middle, so the factor does not matter.
     grid = grid * ((1 - (child_scale / n) ** 2) / (1 - (1 / n) ** 2).clamp_min(0.75)).clamp_min(0).sqrt()
     rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"][parents], dim=-1))  # [Q, 3, 3]
     # Not a batched matrix product: cuBLAS takes 3×3 matrices 65,535 at a time.

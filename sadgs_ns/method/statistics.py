@@ -54,11 +54,11 @@ STATISTICS: dict[str, Statistic] = {
     "n_total": Statistic((), lambda values, eta: _count(values, eta[..., 0] >= 0)),
 }
 """The statistics by their names in the strategy's state: numbers of violations, of low responses, the largest η of each
-axis, and the number of observations. Whatever is added here is kept, forgotten, stored and planned for as these are."""
+axis, and the number of observations. One that is added here is kept, emptied, saved and planned for like these."""
 
 
 def empty_statistics(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
-    """Return the `STATISTICS` of Gaussians that nobody has seen yet."""
+    """Return the `STATISTICS` of Gaussians that no view has observed yet."""
     return {name: torch.zeros((num_gaussians, *s.shape), device=device) for name, s in STATISTICS.items()}
 
 
@@ -102,14 +102,14 @@ def observed_eta(
     seen = visible(info)  # [C, N]
     num_cameras, num_gaussians = seen.shape
     scales, views = torch.exp(params["scales"]), []
-    # Every Gaussian is measured and the unseen are masked out: selecting them first would make the host wait.
+    # Every Gaussian is measured, and unseen ones are masked out: selecting first would make the host wait.
     for camera in range(num_cameras):
         camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
         viewmats = info["viewmats"][camera].expand(num_gaussians, 4, 4)
         Ks = info["Ks"][camera].expand(num_gaussians, 3, 3)
         shapes = params["means"], params["quats"], scales
         axes = projected_axes(*shapes, viewmats, Ks, info["width"], info["height"])  # [N, 3, 2]
-        # An unseen Gaussian's projection is garbage; its sample is moved to a place where nothing can overflow.
+        # An unseen Gaussian's projection is garbage, so its sample is moved to a place where nothing can overflow.
         means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
         a, b, c = info["conics"][camera].unbind(-1)
         # Python numbers: a tensor made of them here would make the host wait for its copy to the device.

@@ -3,7 +3,7 @@
 Each view is compared with a few neighbours, which see the same points from other directions. A hypothesis is an inverse
 depth: it says where a pixel lies in a neighbour. The windows around both places are compared by their zero-mean
 normalised cross-correlation (NCC), which ignores exposure. The coarsest level tests the view's whole range of depths,
-each finer level a few around the depth known so far. In the end, a depth counts only where neighbours agree with it.
+each finer level a few around the best so far. In the end, a depth counts only where neighbours agree with it.
 
 Pixels move evenly with inverse depth, and planes are linear in it. A picture spans [−1, 1]², as for `grid_sample`.
 """
@@ -23,11 +23,11 @@ from sadgs_ns.method.near_plane import depths_in_views
 WORKING_SIDE = 800  # Longest side in px at which depth is computed; larger images are reduced: time grows with the area
 LEVELS = 3  # Levels of the image pyramid. Each has half the sides of the one before
 WINDOW = 5  # Side in px, odd, of the windows that are compared
-SMOOTHING = 5  # Side in px, odd, of the box over which scores are averaged: plain pixels follow their neighbours
+SMOOTHING = 5  # Side in px, odd, of the box over which scores are averaged; plain pixels follow their neighbours
 HYPOTHESES = 128  # Most intervals of inverse depth on the coarsest level. Time and memory grow with them
 NEIGHBOURS = 4  # Neighbours per view. Time grows with them; with fewer, occlusions leave holes
 NOISE = 0.004  # Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0
-SCORES = (0.5, 0.8)  # Correlation at which confidence begins, and from which on it is full. Lower ones add few pixels
+SCORES = (0.5, 0.8)  # Correlations at which confidence begins and is full. Lower ones add few pixels
 AGREEING = 3  # Neighbours that agree with a depth of full confidence, or all if there are fewer
 DEPTH_TOLERANCE = 0.01  # Largest relative difference between two views' depths that agree
 PIXEL_TOLERANCE = 1.0
@@ -53,7 +53,7 @@ class DepthMap:
 
 @dataclass(frozen=True)
 class _View:
-    """A view at working size, and how it lies to its neighbours."""
+    """A view at working size, and its geometry relative to its neighbours."""
 
     levels: list[Tensor]
     """Grey value around 0, and 1 where it is valid; both are 0 elsewhere. From fine to coarse. Each [2, h, w]"""
@@ -118,8 +118,8 @@ def choose_neighbours(
 ) -> Tensor:
     """Choose the views with which each view is compared, given float64 arguments of `depths_in_views`.
 
-    Two views gain from every point that both see: less if the angle between their rays is too small or too wide, and
-    less if one of them sees it larger. A view counts less if one that is chosen already lies in the same direction.
+    Two views gain from every point that both see: less if the angle between their rays is too small or wide, or if one
+    sees the point larger. A view counts less if one that is chosen already lies in the same direction.
 
     Returns:
         Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]

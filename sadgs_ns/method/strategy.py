@@ -23,7 +23,7 @@ from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
 Infos = Info | Sequence[Info]
-"""The info of the views of a step, or a list of those of its views of each size."""
+"""gsplat's info of the views of a step, or a list with one info for each image size."""
 _WINDOWS = tuple(field.name for field in fields(Windows))
 
 TAU_PRUNE = 0.8
@@ -45,8 +45,8 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
-    On CUDA fewer are added, with a warning, where the device's memory would not hold them."""
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first. On CUDA fewer are
+    added, with a warning, if the device's memory cannot hold more."""
     structure_every: int | None = None
     """Iterations between structure-aware split and prune steps; None is a sixth of the run, 0 turns them off."""
     absgs_every: int | None = None
@@ -58,8 +58,8 @@ class StructureAwareStrategy(Strategy):
     """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there.
     None is 16/30 of the run, and 19/30 are the most; 0 adds and removes none at all."""
     eta_every: int | None = None
-    """Iterations between η observations; None is a three-hundredth of the run.
-    The paper observes at every iteration, which costs time and brings nothing."""
+    """Iterations between η observations; None is a three-hundredth of the run. The paper observes at every iteration,
+    which takes time and improves nothing."""
     tau_split: float = 0.8
     """Fraction of a Gaussian's observations that must violate (η > 1) before an axis is split."""
     min_observations: int = 3
@@ -89,7 +89,7 @@ class StructureAwareStrategy(Strategy):
     The cap and the ranking are those of all processes, and densification ends with equal shards."""
 
     def for_run(self, num_iterations: int, world: World | None = None) -> StructureAwareStrategy:
-        """Return this strategy for a run: windows that are None are derived from its length, and all fit into it.
+        """Return this strategy fitted to a run: windows that are None are derived from the run's length.
 
         `world` are the processes among which the Gaussians are shared out; None keeps this strategy's.
         """
@@ -100,7 +100,7 @@ class StructureAwareStrategy(Strategy):
 
     @property
     def windows(self) -> Windows:
-        """The times of densification; where a window is None, as in a run of 3,000 iterations."""
+        """The times of densification; a window that is None is as in a run of 3,000 iterations."""
         if self._fitted is not None:  # Steps ask for them often.
             return self._fitted
         given = self._given
@@ -126,7 +126,7 @@ class StructureAwareStrategy(Strategy):
                 raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """State to pass to the other methods; its tensors are made at the first step.
+        """Return the state to pass to the other methods; its tensors are made at the first step.
 
         Each structure step appends its numbers of Gaussians to the list `structure_steps`. With a `CameraPaths` under
         `camera_paths`, each densification step prunes the haze near these, until densification ends. `scene_scale` is
@@ -142,16 +142,16 @@ class StructureAwareStrategy(Strategy):
             raise ValueError(f"params lack {sorted(missing)}: StructureAwareStrategy needs them by these names")
 
     def observes(self, step: int) -> bool:
-        """Whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
+        """Tell whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
         windows = self.windows
         periods = [rule.every(windows) for rule in RULES.values() if rule.reads == "statistics"]
-        # After the last step that reads it, nobody does.
+        # Nothing reads it after the last such step.
         return step % windows.eta_every == 0 and (
             min(next_due(step + 1, every) for every in periods) <= windows.refine_stop_iter
         )
 
     def densifies(self, step: int) -> bool:
-        """Whether `step_post_backward` may put other tensors in the place of parameters or statistics at this step."""
+        """Tell whether `step_post_backward` may replace tensors of parameters or statistics at this step."""
         iteration, windows = step + 1, self.windows
         if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
             return False
@@ -159,7 +159,7 @@ class StructureAwareStrategy(Strategy):
         return ends or resets or due_rule(iteration, windows) is not None
 
     def needs_absgrad(self, step: int) -> bool:
-        """Whether an AbsGS step will read this step's absolute screen gradients; a structure step forgets them."""
+        """Tell whether an AbsGS step will read this step's absolute screen gradients; a structure step drops them."""
         windows = self.windows
         first = max(step + 1, windows.refine_start_iter)
         readers = [rule for rule in RULES.values() if rule.reads is not None]
@@ -192,7 +192,7 @@ class StructureAwareStrategy(Strategy):
         self.densify(params, optimizers, state, step, info)
 
     def accumulate(self, state: State, step: int, info: Infos) -> None:
-        """Add the screen gradients of a backward pass, where an AbsGS step will read them."""
+        """Add the screen gradients of a backward pass if an AbsGS step will read them."""
         if step >= self.windows.refine_stop_iter or not self.needs_absgrad(step):
             return
         views = _views(info)
@@ -201,7 +201,7 @@ class StructureAwareStrategy(Strategy):
             accumulate_gradients(state, view, num_views)
 
     def densify(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Infos) -> None:
-        """Split, clone, prune and reset Gaussians where that is due after this step."""
+        """Split, clone, prune and reset Gaussians if that is due after this step."""
         iteration, windows, views = step + 1, self.windows, _views(info)
         if not windows.refine_start_iter <= iteration <= windows.refine_stop_iter:
             return
@@ -219,17 +219,17 @@ class StructureAwareStrategy(Strategy):
             rebalance(self.world, params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
-        """Gaussians whose η was low on all three axes in more than τ_prune of their observations. bool [N]"""
+        """Tell which Gaussians had a low η on all three axes in more than τ_prune of their observations. bool [N]"""
         n_low, n_total = statistics["n_low"], statistics["n_total"]
         return consistent(n_low, n_total, TAU_PRUNE, self.min_observations).all(dim=1)
 
     def planned_children(self, params: Params, statistics: Mapping[str, Tensor]) -> Tensor:
-        """n per axis that a structure step would split by now, 1 where whole or over the cap. int64 [N, 3]"""
+        """Return n per axis of a structure step now; 1 where nothing is split or the cap forbids it. int64 [N, 3]"""
         proposal, fits = self.planned_growth(structure_aware, params, statistics)
         return torch.where(fits[:, None], proposal.children, 1)
 
     def planned_growth(self, propose: Propose, params: Params, state: Mapping[str, Any]) -> tuple[Proposal, Tensor]:
-        """The proposal of a rule by now, and the Gaussians that the cap lets grow, bool [N]."""
+        """Return a rule's present proposal, and which Gaussians the cap lets grow, bool [N]."""
         proposal = propose(self, params, state)
         room = self.max_gaussians - len(params["means"])
         return proposal, limit_growth(self.world, proposal.growth, proposal.priority, room)
@@ -237,12 +237,12 @@ class StructureAwareStrategy(Strategy):
     def _grow(
         self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
-        """Prune, let Gaussians grow as a rule proposes and room allows, and forget the state that it has read."""
+        """Prune, let Gaussians grow as a rule proposes and memory allows, and empty the state that it has read."""
         n_before, n_low, n_pruned, by_eta = len(params["means"]), 0, 0, rule.reads == "statistics"
         if by_eta:
             is_low = self.consistently_low(state)
             n_low = int(is_low.sum())
-            # The final prune comes before children are made: they are fainter than their parents, and would go, too.
+            # The final prune comes before children are made: fainter than their parents, they would be pruned, too.
             faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
             n_pruned = self._prune_faint(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
             map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
@@ -269,7 +269,7 @@ class StructureAwareStrategy(Strategy):
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _room(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> tuple[int, float]:
-        """How many Gaussians may be added under the cap, and how many fit in the devices' memory beside such views."""
+        """Return how many Gaussians the cap lets be added, and how many fit in the devices' memory with such views."""
         free = free_bytes(params["means"].device)
         in_memory = affordable_growth(params, state, free, StepSize.of(views))
         # The device with the least room bounds all, since shards are evened out.
@@ -277,7 +277,7 @@ class StructureAwareStrategy(Strategy):
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
     def _prune_faint(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
-        """Remove haze, Gaussians less opaque than this, and others; return how many these were."""
+        """Remove haze, Gaussians less opaque than this, and `others`; return how many were removed."""
         gone = opacities(params) < opacity
         if (paths := state.get("camera_paths")) is not None:
             gone |= paths.haze(params["means"].detach(), params["scales"].detach().exp())

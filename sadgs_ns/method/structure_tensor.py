@@ -1,7 +1,7 @@
 """Image → multi-scale structure tensor map S̄ (paper, section 3.2, eq. 2–5).
 
 Borders and masks are handled by normalised convolution: every blur is a weighted mean over the valid pixels that the
-kernel reaches, and the derivative is that of this mean. So no edge appears at a mask, and images may be small.
+kernel reaches, and the derivative is that of this mean. So a mask makes no edge, and images may be small.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def gaussian_kernel(
 ) -> Tensor:
     """Sample a 1-D Gaussian, or its derivative, for cross-correlation; it is computed in float64. [2·⌈3σ⌉ + 1]
 
-    Kernels are kept on the device: making them anew for each batch of images would take most of the time.
+    Kernels are kept on the device, because making them for each batch of images would take most of the time.
 
     Args:
         sigma: Standard deviation in px, > 0.

@@ -1,4 +1,4 @@
-"""Choosing, reading and writing checkpoints; nothing in a file that is read is executed."""
+"""Choose, read and write checkpoints; reading a file never executes anything in it."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
             if (damaged := file.testzip()) is not None:
                 raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
-    except Exception as error:  # Damaged archives, pickles and tensors each raise their own.
-        # torch's message goes on with advice to load the file unsafely.
+    except Exception as error:  # Damaged archives, pickles and tensors raise different errors.
+        # The rest of torch's message advises to load the file unsafely.
         problem = re.split(r"(?<=[a-z])[.:]\s", reason(error), maxsplit=1)[0]
         raise InputError(
             f"{path} is cut off, damaged or not of tensors and plain values alone ({problem}): {remedy}."
@@ -83,7 +83,7 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
 
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Return a checkpoint whose tensors [N, …] of Gaussians went, in a fixed order, through `change`."""
+    """Return a checkpoint after `change` was applied to its tensors [N, …] of Gaussians, in a fixed order."""
     pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
     pipeline |= {name: change(pipeline[name]) for name in names}
@@ -99,7 +99,7 @@ def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[
 
 
 def _rows(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Change tensors that have rows; Adam's number of steps has none."""
+    """Change tensors that have rows, which Adam's number of steps has not."""
     return {
         key: change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
         for key, value in sorted(values.items())

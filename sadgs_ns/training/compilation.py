@@ -21,7 +21,7 @@ _PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting 
 
 
 def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:
-    """Return what decides the kernels of a run."""
+    """Return what decides which kernels a run needs."""
     model, sizes = pipeline.model, pipeline.datamanager.train_dataset.cameras
     alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
     for name, optimizer in optimizers.items():

@@ -1,8 +1,8 @@
-"""Compiles the kernels of the method's defaults from the first second of a machine's first run, in processes.
+"""Compile the kernels of the method's defaults from the first second of a machine's first run, in other processes.
 
-A process of its own finds which kernels the stages of a step would launch, without a launch, and forks others that
-compile them side by side into Triton's cache: in one process, threads would wait for each other in Python. No process
-outlives the run. A file in the cache tells later runs that this is done.
+One process finds which kernels the stages of a step would launch, without launching any, and forks others that compile
+them side by side into Triton's cache; threads of one process would wait for each other in Python. No process outlives
+the run. A file in the cache tells later runs that this is done.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from typing import Any
 
 from sadgs_ns.events import progress
 
-_FEWEST_CORES = 3  # Two are busy with the run itself
-_LONGEST = 60.0  # Seconds without another kernel after which the run goes on alone
+_FEWEST_CORES = 3  # The run itself keeps two busy
+_LONGEST = 60.0  # Seconds without progress after which the run goes on alone
 _HERE, _CARDS = Path(__file__).parent, Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
 _found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options of each kernel, for forked processes
 
 
 def begin() -> None:
-    """Begin to compile, unless it has begun, was done before, or there is no GPU or no core to spare."""
+    """Begin to compile, unless that has begun, was done before, or there is no GPU or no spare core."""
     global _process
     if _process is None and (marker := _marker()) and not marker.exists():
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
@@ -46,7 +46,7 @@ def begin() -> None:
 
 
 def wait() -> None:
-    """Wait until what `begin` started has ended, and report how far it is."""
+    """Wait until the process of `begin` has ended, and report its progress."""
     global _process
     if _process is None:
         return
@@ -55,12 +55,12 @@ def wait() -> None:
     while select.select([told], [], [], _LONGEST)[0] and (lines := os.read(told, 2**16)):
         for done, total in re.findall(rb"(\d+) of (\d+)\n", lines)[-1:]:
             progress("compiling kernels", int(done), int(total))
-    with _process:  # Its input closes, at which it ends.
+    with _process:  # It ends when its input closes.
         _process = None
 
 
 def _marker() -> Path | None:
-    """Return the file in Triton's cache that tells that this was done, or None where it is not to be done.
+    """Return the file in Triton's cache that says that this was done, or None if it should not be done.
 
     This imports neither torch nor Triton, which would take a second.
     """
@@ -132,7 +132,7 @@ def compile_kernel(index: int) -> None:
 
 def main() -> None:
     """Compile all kernels, and tell after each how many are done, and of how many; runs in the process of `begin`."""
-    os.nice(5)  # The run is to go on meanwhile.
+    os.nice(5)  # The run must go on meanwhile.
     find_kernels()
     processes = min(len(_found), len(os.sched_getaffinity(0)) - 1)
     with ProcessPoolExecutor(processes, get_context("fork"), _begin_compiler) as pool:
@@ -150,6 +150,6 @@ def _begin_compiler() -> None:
 
 
 def _end_with_the_run() -> None:
-    """End this process, those beside it and what they have started when the run closes their input, or ends itself."""
+    """End this process, its siblings and their children when the run closes their input, or ends."""
     os.read(0, 1)
     os.killpg(0, signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Training steps of few Gaussians as CUDA graphs: one call of the host launches all kernels of a step.
+"""Training steps of few Gaussians as CUDA graphs: one call on the host launches all kernels of a step.
 
 On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the
 arguments with which they were captured. So cameras, images and Adam's rates are copied, before each step, into tensors
@@ -31,7 +31,7 @@ otherwise be captured more often than they are replayed."""
 
 
 class Results(NamedTuple):
-    """What a graph leaves on the device; its next replay overwrites it."""
+    """The results of a graph on the device; its next replay overwrites them."""
 
     values: Tensor  # Loss, PSNR in dB, two unused numbers, and NaN if a gradient was left out, else 0. [5]
     pair_counts: Tensor  # Pairs of a Gaussian and a tile of each view. int64 [V]
@@ -62,7 +62,7 @@ class CudaGraphs:
             try:
                 results = function()
             except BaseException:
-                with contextlib.suppress(RuntimeError):  # The function's own error says more.
+                with contextlib.suppress(RuntimeError):  # The function's own error tells more.
                     graph.capture_end()
                 self._repair_generator()
                 raise
@@ -79,7 +79,7 @@ class CudaGraphs:
         return replay
 
     def wait(self) -> None:
-        """Wait until no graph is running, before which none may be dropped."""
+        """Wait until no graph is running; a running one must not be dropped."""
         torch.cuda.synchronize(self._device)
 
     def _repair_generator(self) -> None:
@@ -137,7 +137,7 @@ class GraphedSteps:
         self.failure = ""
 
     def prepare(self, num_views: int) -> bool:
-        """Tell whether steps of so many views may be replayed now. If not, free the graphs' memory."""
+        """Tell whether steps of this many views may be replayed now. If not, free the graphs' memory."""
         if not self.failure and num_views * self._model.num_points <= MOST_GAUSSIANS:
             return True
         self._drop()
@@ -206,7 +206,7 @@ class GraphedSteps:
         self._launched.clear()
 
     def _give_up(self, error: Exception) -> None:
-        """Capture no step from now on, and print why."""
+        """Stop capturing steps, and print why."""
         self.failure = reason(error)
         self._drop()
         self._recorder = None

@@ -52,7 +52,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             _check_sizes(dataset)
 
     def create_train_dataset(self) -> InputDataset:
-        """Make the dataset with COLMAP's points, which nerfstudio would read in ten times the time."""
+        """Make the dataset with COLMAP's points, for which nerfstudio would take ten times as long."""
         if self._points is not None:
             outputs = self.train_dataparser_outputs
             points = colmap.read_points(self._points)
@@ -60,7 +60,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
-        """Make the dataset without reading the points a second time; nobody uses them."""
+        """Make the dataset without reading the points again; nothing uses them."""
         parser: Any = self.config.dataparser
         if hasattr(parser, "load_3D_points"):
             parser.load_3D_points = False

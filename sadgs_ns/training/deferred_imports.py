@@ -1,7 +1,7 @@
 """Modules that nerfstudio imports at its start, and that a run of `sadgs` never uses.
 
-They take over half of its time. While a module of nerfstudio is imported, each that it need not have is a stand-in,
-which imports the true module when something asks for it. Whoever imports that later gets the true one.
+They take over half of its time. While a module of nerfstudio is imported, each module that it need not have is replaced
+by a stand-in, which imports the real module when something asks for it. Later imports get the real one.
 """
 
 from __future__ import annotations

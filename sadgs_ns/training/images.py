@@ -1,4 +1,4 @@
-"""Images that are decoded and undistorted at each access, or copied to the device ahead of their step."""
+"""Images that are decoded and undistorted when they are needed, or copied to the device ahead of their step."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32],
 
 
 def thread_count(requested: int | None) -> int:
-    """Return the number of threads that decode images in this process, by default one a core, up to 16."""
+    """Return the number of threads that decode images in this process; by default one per core, up to 16."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return requested or min(max(cores // processes_on_this_machine(), 1), 16)
 
@@ -46,8 +46,8 @@ def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: 
 class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 
-    Several threads may access images at once. The dataset is for this object only: its cameras become those of the
-    undistorted images at once, without opening one.
+    Several threads may access images at once. The dataset belongs to this object: its cameras become those of the
+    undistorted images at once, without opening any.
     """
 
     def __init__(self, dataset: InputDataset) -> None:
@@ -55,7 +55,7 @@ class LazyImages(Sequence[dict[str, Any]]):
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
         self._undistort = _undistort_cameras(dataset.cameras)
         self._dataset = copy.copy(dataset)
-        self._opencv_agrees: bool | None = None  # unknown until a JPEG was decoded
+        self._opencv_agrees: bool | None = None  # None until a JPEG has been decoded
         if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
             self._dataset.get_numpy_image = self._decode
 
@@ -89,7 +89,7 @@ class LazyImages(Sequence[dict[str, Any]]):
         return {**data, "image": image}
 
     def _decode(self, image_idx: int) -> NDArray[np.uint8]:
-        """Decode an image as nerfstudio does, but a JPEG with OpenCV, unless its pixels differ. [H, W, 3 or 4]
+        """Decode an image as nerfstudio does, or a JPEG with OpenCV if that gives the same pixels. [H, W, 3 or 4]
 
         For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms.
         """
@@ -187,7 +187,7 @@ class ImagePrefetcher:
             pool.shutdown(cancel_futures=True)
 
     def _load(self, indices: Iterable[int]) -> None:
-        """Have threads load images in this order, unless they are under way."""
+        """Let threads load images in this order, unless they are being loaded."""
         if self.decoded:
             return
         for index in indices:

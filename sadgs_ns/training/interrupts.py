@@ -1,4 +1,4 @@
-"""How SIGINT, SIGTERM and SIGHUP stop a run between two steps, and where it prints once its output is gone."""
+"""Let SIGINT, SIGTERM and SIGHUP stop a run between two steps, and let it print elsewhere once its output is gone."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import Any
 from rich.console import Console
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that ask a run to stop. The last one is that of a terminal that is gone, as when ssh is cut off."""
+"""Signals that ask a run to stop. The last one comes when a terminal is gone, for instance because ssh was cut off."""
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal asked the run to stop, and no step is half done."""
+    """A signal asked the run to stop; it stands between two steps."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -27,9 +27,9 @@ class Interrupted(KeyboardInterrupt):
 class Interrupts:
     """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
-    A signal that the program handles itself, or ignores, is left alone. While `waiting` returns True, nobody polls, and
-    signals raise at once. A process that `started` this one sends SIGTERM when it is interrupted itself, so then
-    SIGTERM after another signal is ignored.
+    Signals that the program handles or ignores are left alone. While `waiting` returns True, nobody polls, and signals
+    raise at once. A process that `started` this one sends SIGTERM when it is interrupted itself, so then SIGTERM after
+    another signal is ignored.
     """
 
     def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:

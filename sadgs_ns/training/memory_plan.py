@@ -1,4 +1,4 @@
-"""Plans memory before the first step: where the images are kept, and how many Gaussians the device holds."""
+"""Plan memory before the first step: where the images are kept, and how many Gaussians the device can hold."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
 PLANNED_SHARE = 0.8  # Share of the available memory to plan with; the rest is for fragments and other programs
 QUANTIZED_BYTES = 3  # Bytes that S̄ takes for each pixel of the training images (`method.quantization`)
 STRUCTURE_PIXEL_BYTES = 300  # Bytes that a pixel takes at most while S̄ is computed
-MANY_IMAGES = 500  # nerfstudio would keep up to so many training images on the device, whatever their size
+MANY_IMAGES = 500  # Up to this many training images nerfstudio would keep on the device, however large they are
 IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
 """Largest shares of the device's free memory for the images if there are more than `MANY_IMAGES`, and if not."""
 HOST_SHARE = 0.5
@@ -30,7 +30,7 @@ since it rounds up to powers of two."""
 
 @dataclass(frozen=True)
 class TrainingSize:
-    """What a run keeps and renders besides its Gaussians."""
+    """What a run keeps and renders, apart from its Gaussians."""
 
     image_bytes: float  # Bytes of images and their S̄ on the training device
     step: StepSize  # The largest step of the run, without the Gaussians' pairs
@@ -39,7 +39,7 @@ class TrainingSize:
 
 
 def training_size(datamanager: FullImageDatamanager, views: int, processes: int = 1) -> TrainingSize:
-    """Measure a run with so many views a step, shared out to processes, without opening an image."""
+    """Measure a run with this many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     structure = 0.0
@@ -66,9 +66,9 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
 
 
 def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
-    """Set where the images are kept, by the free memory and alike in all processes; call before they are loaded.
+    """Choose where the images are kept, by the free memory, alike in all processes; call before they are loaded.
 
-    Returns a line for the user; None if images are kept on the device, or where the user asked for.
+    Returns a line for the user; None if images are kept on the device, or where the user said.
     """
     config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
     host = least(host_memory.available_host_bytes() / sharing, device)

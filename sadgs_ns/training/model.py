@@ -38,14 +38,14 @@ from sadgs_ns.viewer import maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 CAMERA_CLEARANCE = 2.0
-"""Initial Gaussians within so many of their standard deviations of a camera are dropped, other than in the paper. That
+"""Initial Gaussians within this many of their standard deviations of a camera are dropped, unlike in the paper. That
 brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
-NORMALS = "normals"  # Name of an output that is computed only if it is read
+NORMALS = "normals"  # Name of an output that is computed only when it is read
 LIMIT_EVERY = 25  # Iterations between limits on scales, in which an axis grows at most threefold at the presets' rates
 
 
 class SadgsModel(SplatfactoModel):
-    """The Gaussians, how they are rendered, and their loss; a splatfacto model for nerfstudio's other programs."""
+    """The Gaussians, their rendering and their loss; nerfstudio's other programs see a splatfacto model."""
 
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
@@ -54,13 +54,13 @@ class SadgsModel(SplatfactoModel):
     plan: RunPlan
 
     def populate_modules(self) -> None:
-        """Make parameters, metrics and the strategy; splatfacto's way needs CUDA, and LPIPS's weights at once."""
+        """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
         config = self.config
         config.check()
         self.strategy = config.strategy
         self.strategy_state = self.strategy.initialize_state()
         params, self.synthetic = initial_gaussians(config, self.seed_points)
-        """Which initial Gaussians stand for no SfM point, but are random or on the bounding box. bool [N]"""
+        """Tell which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]"""
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -77,11 +77,11 @@ class SadgsModel(SplatfactoModel):
         self.world = World()
         if config.color_model == "affine":
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
-            # An index made in a step would have to be copied to the device there.
+            # An index that is made in a step must be copied to the device in that step.
             self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
     def set_cameras(self, cameras: Cameras) -> None:
-        """Fit extent, initial Gaussians and near plane to the training cameras; call before optimizers are made."""
+        """Set extent, initial Gaussians and near plane for the training cameras; call before optimizers are made."""
         positions = camera_positions(cameras)
         self.strategy_state["scene_scale"] = extent = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
@@ -98,7 +98,7 @@ class SadgsModel(SplatfactoModel):
             self.near_plane = scene_near_plane(points, viewmats, cameras.get_intrinsics_matrices(), sizes, extent)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
-        """Start from more points, as far as the cap has room; call before optimizers are made. Return how many.
+        """Start from more points, as many as the cap allows; call before optimizers are made. Return their number.
 
         They have means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], in world units; the
         distance to neighbours limits these, too.
@@ -117,7 +117,7 @@ class SadgsModel(SplatfactoModel):
         return room
 
     def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune haze near the training cameras [C, 4, 4], if the options ask for it."""
+        """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it."""
         if self.config.clear_paths:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             if self.config.random_init and self.seed_points is not None:
@@ -139,7 +139,7 @@ class SadgsModel(SplatfactoModel):
         return self.num_points if self.world.alone else self.world.total
 
     def follow(self, plan: RunPlan) -> None:
-        """Densify, average and draw according to a plan from now on."""
+        """From now on, densify, average and draw according to a plan."""
         self.plan, self.near_plane = plan, plan.near_plane
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
@@ -235,7 +235,7 @@ class SadgsModel(SplatfactoModel):
         return self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
-        """Put renderings [C, H, W, ≥ 3] with their opacity [C, H, W, 1] before a background [3]. → [C, H, W, 3]"""
+        """Put renderings [C, H, W, ≥ 3] with their opacity [C, H, W, 1] on a background [3]. → [C, H, W, 3]"""
         if self.config.background_color == "black":
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
@@ -311,7 +311,7 @@ class SadgsModel(SplatfactoModel):
         return _constant_color(float(self.config.background_color == "white"), self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
-        """Put images in [0, 1] [..., H, W, 3 or 4] before the background, [3] or [H, W, 3], if they have alpha."""
+        """Put images in [0, 1] [..., H, W, 3 or 4] on the background, [3] or [H, W, 3], if they have alpha."""
         if image.shape[-1] == 4:
             alpha = image[..., 3:]
             return alpha * image[..., :3] + (1 - alpha) * background
@@ -326,7 +326,7 @@ class SadgsModel(SplatfactoModel):
         return {"main_loss": photometric_loss(views[0], views[1], ssim_lambda=self.config.ssim_lambda)[0]}
 
     def masked_pair(self, rgb: Tensor, batch: Mapping[str, Any], background: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a rendering and its photo […, H, W, 3] within the mask, before the same background, for the loss.
+        """Return a rendering and its photo […, H, W, 3] within the mask, on the same background, for the loss.
 
         `rgb` is not clamped, and `batch` holds `image`, uint8 or floats in [0, 1] […, H, W, 3 or 4], and perhaps a
         boolean `mask` […, H, W, 1]. The photo stays in bytes if nothing changes it.

@@ -1,4 +1,4 @@
-"""Losses and gradients that are not finite: flagged on the device, and read now and then, so that no step waits."""
+"""Losses and gradients that are not finite. The device flags them, and the host reads the flags now and then."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class NonFiniteLog:
         # The first column is NaN if a gradient was left out. Triton would compile Adam anew for rows not aligned to 16
         # bytes.
         self._gradients = torch.zeros((capacity, 4), device=device)
-        self._slots = self._gradients[:, :1].unbind()  # once, because slicing takes the host long
+        self._slots = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
         self.capacity, self.steps, self.streak = capacity, 0, 0
 

@@ -1,4 +1,4 @@
-"""The optimizers: Adam in one launch for all parameters, and learning rates that decay over the run's length."""
+"""Adam in one launch for all parameters, and learning rates that decay over the run's length."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sadgs_ns.kernels import use_triton
 from sadgs_ns.training.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 from sadgs_ns.training.options import hide
 
-_ONE = torch.tensor(1.0, device="cpu")  # The host adds this to a count of steps in a third of the time for Python's 1
+_ONE = torch.tensor(1.0, device="cpu")  # Adding this to a count of steps takes a third of the time of adding Python's 1
 
 
 class FusedAdam(Adam):
@@ -126,13 +126,13 @@ class SadgsOptimizers(Optimizers):
 @hide("max_norm", "weight_decay")
 @dataclass
 class FusedAdamOptimizerConfig(AdamOptimizerConfig):
-    """Adam; only its rate is an option of the command line."""
+    """Adam; only its rate is an option on the command line."""
 
     _target: type = FusedAdam
     lr: float = 1e-3
     """Learning rate; where there is a schedule, its factors multiply it."""
     eps: Suppress[float] = 1e-15
-    """What Adam adds to the root of the second moment; as in 3DGS."""
+    """Adam adds this to the root of the second moment; as in 3DGS."""
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""What the classes of options share: options that `--help` does not show, and the ranges of values."""
+"""Hide options from `--help`, and check the ranges of their values."""
 
 from __future__ import annotations
 

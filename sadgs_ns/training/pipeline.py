@@ -36,7 +36,7 @@ from sadgs_ns.viewer.elements import shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
 _NAMED_STEPS = 5  # Number of iterations whose images a report of losses that are not finite names
-_SAMPLED = 1000  # About so many cameras, and Gaussians, are enough to find out whether training can see anything
+_SAMPLED = 1000  # About so many cameras and Gaussians suffice to find out whether training can see anything
 
 
 class SadgsPipeline(VanillaPipeline):
@@ -88,7 +88,7 @@ class SadgsPipeline(VanillaPipeline):
         return self._model  # type: ignore[return-value]
 
     def follow(self, plan: RunPlan) -> None:
-        """Train and draw according to a plan from now on."""
+        """From now on, train and draw according to a plan."""
         self.model.follow(plan)
         self.structure.set_max_gaussians.value = plan.strategy.max_gaussians
         self.structure.set_tau_split.value = plan.strategy.tau_split
@@ -163,7 +163,7 @@ class SadgsPipeline(VanillaPipeline):
         model = self.model
         groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         for index, data in self.views.draw(model.plan.views_per_iteration):
-            # With several processes, some images are composited, and loaded, by others only.
+            # With several processes, this one loads only the images that it composites.
             groups[data["image"].shape if model.world.alone else self.views.sizes[index]].append((index, data))
         result = []
         for (height, width, *_), views in groups.items():

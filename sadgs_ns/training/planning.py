@@ -1,4 +1,4 @@
-"""Planning a run from its options, its data, the machine's memory and the checkpoint that it goes on from."""
+"""Plan a run from its options, its data, the machine's memory and the checkpoint that it goes on from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) 
 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
-    """Tell whether steps of so many views have too few pixels for several devices, and print so."""
+    """Tell whether steps of this many views have too few pixels for several devices, and print it."""
     pixels = views * _pixels(cameras)
     if pixels >= LEAST_PIXELS * devices:
         return False
@@ -59,7 +59,7 @@ def plan_run(
     before: RunPlan | None,
     done: int,
 ) -> RunPlan:
-    """Decide what a run's options leave open, and print what a user should know.
+    """Decide what the options of a run leave open, and print what a user should know.
 
     The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
     is the plan of the checkpoint's run, of which `done` iterations are done. Raises InputError if `memory_budget_gb`

@@ -44,7 +44,7 @@ def processes_on_this_machine() -> int:
 
 
 def least(number: float, device: torch.device) -> float:
-    """Return the least number, perhaps infinite, that any process of the run passes, so that all decide alike."""
+    """Return the smallest number, perhaps infinite, that any process of the run passes, so that all decide alike."""
     return World(device if dist.is_initialized() else None).least(number)
 
 
@@ -101,7 +101,7 @@ class Peers:
 
 
 def _exists(pid: int) -> bool:
-    """Tell whether a process of this user exists, or has ended but was not reaped by its parent yet."""
+    """Tell whether a process of this user exists, or has ended without being reaped by its parent yet."""
     try:
         os.kill(pid, 0)
     except (ProcessLookupError, PermissionError):  # Another user's process may have the number by now.
@@ -110,7 +110,7 @@ def _exists(pid: int) -> bool:
 
 
 def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
-    """Join the other processes, if there are some, with one seed for all; return them and the local rank."""
+    """Join the other processes, if there are any, with one seed for all; return them and the local rank."""
     if number_of_processes() == 1:
         return World(), local_rank
     cuda = config.machine.device_type == "cuda"

@@ -1,4 +1,4 @@
-"""What a run prints: its progress, how long it will take, and which commands can follow."""
+"""Print a run's progress, the time that it will take, and the commands that can follow."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iterati
 ITERATION_SHARES, TIME_SHARES = (0.0, 0.2, 0.5, 0.6, 1.0), (0.0, 0.17, 0.6, 0.7, 1.0)
 """Shares of a run's iterations, and of its time that they take: they are longest while the most Gaussians are there."""
 _MEASURED_SHARE = 0.35
-"""Share of a run's time after which the time left is told; from less of it, it would be wrong by more than 30 %."""
+"""Share of a run's time after which the time left is told; told sooner, it would be wrong by more than 30 %."""
 
 
 def note(text: str) -> None:
-    """Print a line for the user, as long as it is."""
+    """Print a line for the user, without wrapping it."""
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def warn(text: str) -> None:
     """Print a line in yellow, which `sadgs` shows, too."""
-    if not CONSOLE.quiet:  # as it is in other processes than the first
+    if not CONSOLE.quiet:  # in all processes but the first
         report("warning", told=text)
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True, style="yellow")
 

@@ -23,7 +23,7 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note, warn
 from sadgs_ns.training.run_plan import RunPlan
 
-_SAME_PLACE = 1e-3  # Share of the cameras' extent up to which two cameras are taken for one
+_SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' extent count as one
 
 
 @dataclass
@@ -42,7 +42,7 @@ class Resumption:
         except InputError as error:
             message = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
             raise InputError(message) from error
-        except Exception as error:  # A foreign file may raise anything.
+        except Exception as error:  # A file of another program may raise anything.
             problem = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
                 f"{self.path} is not a checkpoint of this version of sadgs ({problem}): {checkpoints.REMEDY}."
@@ -70,7 +70,7 @@ class Resumption:
                 raise InputError(f"It optimized {' and '.join(more)}, too: {remedy}.")
 
     def load_optimizers(self, optimizers: Optimizers, scaler: GradScaler, schedulers: bool) -> None:
-        """Load the optimizers and, if asked for, their schedulers, and print from where the run goes on."""
+        """Load the optimizers and, if asked for, their schedulers, and print where the run goes on."""
         with self._errors_name_file():
             optimizers.load_optimizers(self.state["optimizers"])
             if "schedulers" in self.state and schedulers:

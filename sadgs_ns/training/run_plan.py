@@ -1,4 +1,4 @@
-"""The plan of a run: everything that `config.yml` leaves to rules, decided once before training."""
+"""The plan of a run: all values that `config.yml` leaves to rules, decided once before training."""
 
 from __future__ import annotations
 

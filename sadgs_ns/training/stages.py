@@ -1,4 +1,4 @@
-"""The stages of a training step on a few Gaussians, which launch all kernels of a run."""
+"""The stages of a training step on a few Gaussians; together they launch all kernels of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
 
 @dataclass(frozen=True)
 class KernelChoice:
-    """What decides which kernels a run launches, and how they are specialised; the defaults are the method's."""
+    """What decides which kernels a run launches and how they are specialised; the defaults are the method's."""
 
     device: torch.device
     views: int = 2  # Views of a step

@@ -1,4 +1,4 @@
-"""The start of training in `sadgs`: what `ns-train sadgs` does, without the import of all that nerfstudio has."""
+"""Start training for `sadgs` as `ns-train sadgs` does, without importing all of nerfstudio."""
 
 # ruff: noqa: E402 - what takes seconds begins before what is imported meanwhile
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tyro.conf import FlagConversionOff, SuppressFixed
 from sadgs_ns.events import report
 from sadgs_ns.training.deferred_imports import import_nerfstudio
 
-import_nerfstudio()  # It precedes what imports nerfstudio.
+import_nerfstudio()  # This comes before any import of nerfstudio.
 
 from nerfstudio.engine.trainer import TrainerConfig
 

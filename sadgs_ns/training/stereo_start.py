@@ -14,8 +14,8 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note
 
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
-"""Range of training views with which a run starts from stereo depth by default. With more views it brought no PSNR and
-little else, for one to two seconds (docs/results.md#dense-start)."""
+"""Numbers of training views with which a run starts from stereo depth by default. With more views it brought no PSNR
+and little else, for one to two seconds (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
@@ -44,7 +44,7 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
         return number > 0
     model, cache = pipeline.model, pipeline.structure_cache
     cached = pipeline.datamanager.cached_train  # Undistorting images changes cameras.
-    # Of a video's frames, neighbours far apart tell more about depth.
+    # Frames of a video that lie far apart tell more about depth.
     chosen = torch.linspace(0, len(cached) - 1, min(len(cached), MOST_VIEWS)).round().long()
     cameras, views = pipeline.datamanager.train_dataset.cameras[chosen], chosen.tolist()
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)

@@ -58,7 +58,7 @@ class StructureCache:
         return next(self.quantized([self.views.datamanager.cached_train[index]]))
 
     def get(self, views: Sequence[tuple[int, Mapping[str, Any]]]) -> list[Tensor]:
-        """Quantized S̄ of a step's views of one size, as drawn, on the device. uint8 [H, W, 3] each
+        """Return the quantized S̄ of a step's views of one size, in their order, on the device. uint8 [H, W, 3] each
 
         All processes pass the same views; the one that composites a view's first rows computes its S̄.
         """

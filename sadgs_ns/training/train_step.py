@@ -1,4 +1,4 @@
-"""A training step: render views, compare them with their photos, differentiate, and update all parameters.
+"""A training step: render views, compare them with their photos, differentiate, update all parameters.
 
 One function serves every run. Several processes come in at `distributed.rasterization.rasterize`, and CUDA graphs
 where the trainer replays a step instead of calling it (cuda_graphs.py).
@@ -50,7 +50,7 @@ class ViewGroup:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a step leaves on the device."""
+    """The results of a step on the device."""
 
     loss: Tensor  # Loss of all processes, without gradient, a scalar
     psnr: Tensor  # PSNR of the views in dB, a scalar
@@ -68,7 +68,7 @@ def training_step(
 ) -> StepResult:
     """Train on the views of a step; the loss is their mean. This enqueues work and changes tensors only.
 
-    It waits for none of it, but in several processes, for the numbers of Gaussians that they send each other. If the
+    It waits for none of it; only several processes wait for the numbers of Gaussians that they send each other. If the
     tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups, neither
     parameters nor moments change.
     """

@@ -1,4 +1,4 @@
-"""The trainer of `ns-train sadgs`: it plans, saves, resumes, and ends a run in one sentence."""
+"""The trainer of `ns-train sadgs`. It plans, saves and resumes a run, and ends a failed one with one sentence."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _LESS_MEMORY = (
 )
 _ANOTHER_ENDED = "Another process of the run ended, and this one with it"
 _NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
-_SAVING_SHARE = 0.01  # Largest share of the time between two checkpoints by the clock that saving may take
+_SAVING_SHARE = 0.01  # Saving may take at most this share of the time between two checkpoints by the clock
 
 
 def _memory(error: torch.cuda.OutOfMemoryError) -> str:
@@ -321,7 +321,7 @@ class SadgsTrainer(Trainer):
         if not self.world.alone:
             state = checkpoints.map_rows(state, self.world.gather_rows)
         if processes.is_rank_zero():
-            # An earlier checkpoint may be better if the run has diverged.
+            # If the run has diverged, an earlier checkpoint may be better.
             keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
             checkpoints.write(self.checkpoint_dir, step, state, keep)
         self.world.all(True)

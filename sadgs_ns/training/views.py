@@ -21,7 +21,7 @@ from sadgs_ns.training.model import SadgsModel
 
 
 class ViewSampler:
-    """Draws the training views of each step, in rounds of every view once, in an order that the seed decides.
+    """Draws the training views of each step. Each round has every view once, in an order that the seed decides.
 
     If a round ends inside a step, the step continues with views of the next round that it does not have yet; those it
     skips come first in the next step. So no view is drawn twice in a step, unless the step takes more than there are.
@@ -43,7 +43,7 @@ class ViewSampler:
         return [self._take_step(order, number) for _ in range(steps)]
 
     def requeue(self, views: Sequence[int]) -> None:
-        """Draw these views again, before all others, because their step did not count."""
+        """Put these views first again, because their step did not count."""
         self._order[:0] = views
 
     def state_dict(self) -> dict[str, Any]:
