@@ -7,8 +7,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed.world import World
 
-_DIGITS = ((20, 11), (10, 10), (0, 10))
-"""Shifts and widths in bits of the parts of a positive float32's 31 bits, the most significant first."""
+_DIGITS = ((20, 11), (10, 10), (0, 10))  # Shifts and widths of the parts of a positive float's 31 bits, highest first
 
 
 @torch.no_grad()

@@ -30,8 +30,7 @@ _SECONDS = 300  # Longest time for making the page, with the download
 _BOOTSTRAP = re.compile(rb'(<script type="application/json" id="sse-bootstrap">)(.*?)(</script>)', re.DOTALL)
 """The page's settings and content."""
 _TO_VIEWER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # From z up to the viewer's frame, in which y is up
-_TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
-"""From z up to the content's frame, which the viewer turns half round its z."""
+_TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])  # From z up to the content's frame, turned half round
 
 
 def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:

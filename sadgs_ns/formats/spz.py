@@ -28,8 +28,7 @@ _MAGIC, _VERSION = 0x5053474E, 3
 _MOST_BITS, _LEAST_BITS = 20, 8  # Binary places of positions; the least are steps of 1/256 of a unit
 _RANGE = 1 << 23
 _COLOR = 0.15 * 255  # Steps in a unit of the harmonic of degree 0
-_AXES = struct.pack("<III", 0xADBE0003, 4, 6)
-"""Record `SPZ_ADOBE_coordinate_system`: its type, its length and x right, y down, z forward, a PLY's axes."""
+_AXES = struct.pack("<III", 0xADBE0003, 4, 6)  # Type, length, and axes right, down and forward, as of a PLY
 _HAS_RECORDS = 2  # Flag of a file with records after the Gaussians; readers that know none stop before them
 _STEP = 4  # Steps of the higher harmonics, in 128ths; gzip makes use of the bits that are always zero
 

@@ -22,8 +22,7 @@ TILE_SIZE = 8
 matter more. A tile has one warp, and each of its lanes two pixels."""
 SWITCH = "SADGS_TRITON"  # Environment variable; 0 keeps a process from using the kernels
 
-_forced: bool | None = False if os.environ.get(SWITCH) == "0" else None
-"""The answer of `use_triton`; None if the device decides."""
+_forced: bool | None = False if os.environ.get(SWITCH) == "0" else None  # Of `use_triton`; None: the device decides.
 _working: set[torch.device] = set()  # Devices on which a kernel has run
 _asked: Counter[torch.device] = Counter()  # Questions to `available` about a device on which no kernel had run
 

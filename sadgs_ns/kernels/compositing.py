@@ -34,8 +34,7 @@ _WARPS = 1  # Warps of a program
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores: three products of the two parts of 11 bits of each factor. "tf32" is
 one, takes a fifth less time and errs by 4e-4 instead of 2e-5; "ieee" takes twice the time."""
-_STRIDE = 12
-"""Numbers in a row of gradients: centre 2, conic 3, opacity 1, colour 3, the centre's absolute gradient 2, unused 1."""
+_STRIDE = 12  # In a row of gradients: centre 2, conic 3, opacity 1, colour 3, centre's absolute gradient 2, unused 1
 
 
 @triton.jit

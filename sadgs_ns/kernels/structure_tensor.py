@@ -13,8 +13,7 @@ from torch import Tensor
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import TINY, load3, store3
 
-_TILES = {2: (16, 64), 3: (2, 512)}
-"""Rows and columns that a program handles, by the axis: tall where the neighbours are above and below."""
+_TILES = {2: (16, 64), 3: (2, 512)}  # Rows and columns of a program, by the axis: tall for neighbours above and below
 _PIXELS = 1024  # Pixels that a program handles where no neighbours matter
 
 

@@ -24,8 +24,7 @@ _FEW_PAIRS, _PART_PAIRS = 64, 256
 one is cut. One that reaches all tiles of an image would take a lane, or a program, longer than the rest of a step."""
 _PART_ROWS, _PART_COLUMNS = 4, 8  # Rows and columns of tiles that a program writes at once, of a part
 _PROGRAMS = 4096  # Most programs that share out the parts: as many as an H100 runs at once, of one warp each
-_PLACE = tl.constexpr(2**24)
-"""Factor on a Gaussian's place in the order by depth, where it is noted with the number of one of its parts."""
+_PLACE = tl.constexpr(2**24)  # Factor on a Gaussian's place by depth, noted with the number of one of its parts
 _ORDER_LANES = 512  # Pairs or tiles that one program handles where the lists are put in order
 
 

@@ -35,8 +35,7 @@ PIXEL_TOLERANCE = 1.0
 
 _POINTS = 2000  # Most SfM points that are used. Neighbours and ranges are sums and quantiles, which need no more
 _TRIPLES = 2**22  # Triples of two views and a point that are computed at a time, in arrays of 32 to 100 MB
-_BEST_ANGLES = (5.0, 15.0)
-"""Degrees between the rays of two cameras to a point, between which depth is accurate and windows look alike."""
+_BEST_ANGLES = (5.0, 15.0)  # Degrees between two cameras' rays, between which depth is accurate and windows look alike
 _WIDEST_ANGLE = 35.0  # Degrees from which on windows look too different to be compared
 _SHARE = 0.02  # A neighbour is usable if its weight is at least this share of the points that the view sees
 _TINY = 1e-6  # Keeps quotients finite. A point behind a camera is projected far outside its picture

@@ -35,8 +35,7 @@ zero twice a period; without the window S̄ follows the phase of the texture ins
 TRUNCATION = 3.0
 """Kernels end at this many standard deviations, without 0.3 % of the mass."""
 
-_ROUNDING_FLOOR = 1e-5
-"""Amplitude relative to the brightest pixel under which float32 rounding, not the image, makes the differences."""
+_ROUNDING_FLOOR = 1e-5  # Amplitude, as a share of the brightest pixel, under which rounding makes the differences
 
 
 @lru_cache(maxsize=256)

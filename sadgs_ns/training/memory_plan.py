@@ -34,8 +34,7 @@ class TrainingSize:
 
     image_bytes: float  # Bytes of images and their S̄ on the training device
     step: StepSize  # The largest step of the run, without the Gaussians' pairs
-    structure_bytes: float = 0.0
-    """Bytes to compute S̄ of a step's images before they are rendered; 0 if that is done once at the start."""
+    structure_bytes: float = 0.0  # To compute S̄ of a step's images before rendering; 0 if all is done at the start
 
 
 def training_size(datamanager: FullImageDatamanager, views: int, processes: int = 1) -> TrainingSize:

@@ -25,10 +25,8 @@ RATES: dict[str, tuple[float, float, float]] = {
 
 Positions, colours and opacities start at 3DGS's rates; scales have four times 3DGS's rate, rotations twice.
 """
-HELD = ("features_dc", "features_rest", "opacities")
-"""Groups whose rates are constant until densification ends, and fall then."""
-CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}
-"""Rates of these groups in the paper's presets, which do not fall."""
+HELD = ("features_dc", "features_rest", "opacities")  # Their rates are constant until densification ends and fall then.
+CONSTANT = {name: (RATES[name][0], 1.0, 1.0) for name in HELD}  # Rates in the paper's presets, which do not fall
 
 
 def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]:

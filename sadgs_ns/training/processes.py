@@ -24,8 +24,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.training.options import check_ranges
 
 _REAPED_SECONDS = 5.0  # Longest time from a message that fails, as its receiver has ended, until the system forgets it
-_TIMEOUT = timedelta(minutes=30)
-"""Longest time that one process waits for another, as in nerfstudio: rank 0 may write a large checkpoint meanwhile."""
+_TIMEOUT = timedelta(minutes=30)  # Longest wait for another process: rank 0 may write a large checkpoint meanwhile
 
 
 def number_of_processes() -> int:

@@ -23,8 +23,7 @@ COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iterati
 """Columns of the table and their widths, which fit a terminal of 80 characters."""
 ITERATION_SHARES, TIME_SHARES = (0.0, 0.2, 0.5, 0.6, 1.0), (0.0, 0.17, 0.6, 0.7, 1.0)
 """Shares of a run's iterations, and of its time that they take: they are longest while the most Gaussians are there."""
-_MEASURED_SHARE = 0.35
-"""Share of a run's time after which the time left is told; told sooner, it would be wrong by more than 30 %."""
+_MEASURED_SHARE = 0.35  # Share of a run's time after which the time left is told; sooner it would be over 30 % off.
 
 
 def note(text: str) -> None:

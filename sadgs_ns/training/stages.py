@@ -36,8 +36,7 @@ class KernelChoice:
     has_color_matrices: bool = False
     alone: bool = True  # Whether one device holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
-    drawing: RenderOptions = _DRAWING
-    """With the backend that draws, and a near plane in front of the Gaussians that are tried."""
+    drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
     updates: tuple[tuple[tuple[int, ...], ...], ...] = (((3,), (15, 3), (3,), (1,), (4,), (3,)),)
     """Of each launch of Adam the shapes of its parameters, without their first dimension."""
     structure_tensor: Callable[[Tensor], Tensor] = field(default=multiscale_structure_tensor, compare=False)

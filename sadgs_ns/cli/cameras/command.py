@@ -48,10 +48,8 @@ from sadgs_ns.training.interrupts import Interrupts
 
 MIN_SIZE = 64  # Least longest side of the result in px; no structure is left in smaller images
 _SECONDS_PER_LINE = 1.0  # Least time between two lines of a stage's progress in a file
-_KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")
-"""Keys that a scene's `transforms.json` keeps when photos are added."""
-_UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "undistorted")
-"""Folders in `work` that each run makes anew."""
+_KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")  # Kept when photos are added
+_UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "undistorted")  # Made anew by each run
 
 
 @dataclass

@@ -22,8 +22,7 @@ from sadgs_ns.method.host_memory import available_host_bytes
 
 MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
 MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
-_CONTRAST = 0.02
-"""Least contrast of a feature, COLMAP's: a photo in [0, 1] needs a third of it in a scale of three per octave."""
+_CONTRAST = 0.02  # COLMAP's least contrast of a feature; a photo in [0, 1] needs a third in a scale of three an octave.
 LISTED, UNLISTED = str.maketrans(" #", "\x1f\x1e"), str.maketrans("\x1f\x1e", " #")  # Stand-ins in names, and back
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
 _AT_ONCE = 256  # Photos whose features are kept, at 1 MB each, until COLMAP has read the photos and they are saved

@@ -22,8 +22,7 @@ from sadgs_ns.events import progress
 
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
 """Largest angle between matching descriptors in radians, and its largest ratio to the next best's; COLMAP's."""
-_LARGEST_FEATURES = 128
-"""Features of each photo by which it is compared with all others; comparing all takes up to 4,096 times the work."""
+_LARGEST_FEATURES = 128  # By so many a photo is compared with all others; all of them take up to 4,096 times the work.
 _COMPARED_AT_ONCE = 500  # Photos that one is compared with at a time, in some .1 GB
 _SAVED_AT_ONCE = 400  # Pairs whose matches are saved and reported together
 _KEPT_PHOTOS = 2000  # Photos whose descriptors stay on the device, at 1 MB each

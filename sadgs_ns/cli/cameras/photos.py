@@ -21,10 +21,8 @@ from sadgs_ns.cli.cameras.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 
-_KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-"""Suffixes that tell COLMAP in which format to write; it reads by what a file holds."""
-_FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)
-"""The second alone tells of a phone's digital zoom."""
+_KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}  # COLMAP writes by these, and reads by content.
+_FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm)  # Only the second knows digital zoom
 _NAMED = 20  # How many unreadable photos a message names
 
 
