@@ -196,8 +196,9 @@ def read_poses(path: Path) -> list[Pose]:
 
 
 def points_file(model: Path) -> Path | None:
-    """Return a reconstruction's file of points, or None; of two the binary one, which nerfstudio prefers."""
-    return next((path for kind in ("bin", "txt") if (path := model / f"points3D.{kind}").is_file()), None)
+    """Return a reconstruction's file of points, or None; of two the one of the cameras' kind, as is of one model."""
+    kinds = (model_kind(model), "bin", "txt")
+    return next((path for kind in kinds if (path := model / f"points3D.{kind}").is_file()), None)
 
 
 def read_points(path: Path) -> Points:

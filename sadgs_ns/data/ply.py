@@ -18,7 +18,7 @@ COLORS = [[prefix + name for name in names] for prefix in _PREFIXES for names in
 GREY = 127  # Colour of points without one, in 0 … 255
 
 
-def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
     Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535: the
@@ -27,8 +27,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """
     try:
         vertices = _read_vertices(path)
-        with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite.
-            positions = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float32)
+        positions = np.stack([vertices[axis] for axis in "xyz"], axis=-1).astype(np.float64)
     except InputError:
         raise
     except OSError as error:

@@ -1,4 +1,4 @@
-"""nerfstudio's loader of whole images, with checks of their names, more threads, and a faster reader of points."""
+"""nerfstudio's loader of whole images, with checks of their names and more threads."""
 
 from __future__ import annotations
 
@@ -6,40 +6,34 @@ import copy
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser, ColmapDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from rich.progress import track
 from torch import Tensor
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.parsers import OWN, choose_parser, points_in_the_run
+from sadgs_ns.data.parsers import OWN, choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.images import LazyImages, thread_count
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
-    """Loads images in threads or on demand, and SfM points fast. Raises InputError for wrong names or sizes."""
+    """Loads images in threads or on demand. Raises InputError for wrong names or sizes."""
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
         config = copy.copy(config)  # The original is written to config.yml.
         choose_parser(config)
         parser = copy.copy(config.dataparser)
-        self._points: Path | None = None  # COLMAP's points, if nerfstudio does not read them itself
         if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
             model = (config.data or parser.data) / parser.colmap_path
             if (source := model / f"images.{colmap.model_kind(model)}").is_file():
                 splits.check_names((name for name, _, _ in colmap.read_poses(source)), source)
-            plain = parser._target is ColmapDataParser and parser.max_2D_matches_per_3D_point == 0
-            if plain and parser.load_3D_points:
-                self._points = colmap.points_file(model)
-                parser.load_3D_points = self._points is None
         parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size.
@@ -50,14 +44,6 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             splits.check_paths(dataset.image_filenames)
             dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
             _check_sizes(dataset)
-
-    def create_train_dataset(self) -> InputDataset:
-        """Make the dataset with COLMAP's points, for which nerfstudio would take ten times as long."""
-        if self._points is not None:
-            outputs = self.train_dataparser_outputs
-            points = colmap.read_points(self._points)
-            outputs.metadata |= points_in_the_run(*points, outputs.dataparser_transform, outputs.dataparser_scale)
-        return super().create_train_dataset()
 
     def create_eval_dataset(self) -> InputDataset:
         """Make the dataset without reading the points again; nothing uses them."""

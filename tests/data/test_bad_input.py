@@ -407,10 +407,6 @@ COLMAP = {
         model(lambda cameras, images, points: images.update({1: images[1]._replace(name="001.png")})),
         r"\S+/images\.bin has more than one pose of \S+/images/001\.png: keep one, or give each an image of its own\.",
     ),
-    "poses-shifted": (
-        move_cameras(lambda centres: centres + 1e7),
-        r"\S+/images\.bin has its cameras 1\.73e\+07 units from the origin and only \S+ apart, which float32 cannot .*",
-    ),
     "pose-far": (
         move_cameras(one_moved_by(1e6), ".txt"),
         r"\S+: image 003\.png has its camera \S+ times as far from the other cameras as those are .*: remove .*\.",
@@ -638,10 +634,6 @@ NERFSTUDIO = {
         meta(lambda m: m["frames"][0].update(fl_x=10**400)),
         r"\S+: frame images/000\.png has fl_x = .*, which is no finite number: correct it\.",
     ),
-    "json-shifted": (
-        meta(lambda m: [row.__setitem__(3, row[3] + 1e7) for f in m["frames"] for row in f["transform_matrix"][:3]]),
-        r"\S+ has its cameras 1\.73e\+07 units from the origin and only \S+ apart, which float32 cannot tell apart: .*",
-    ),
     "json-far": (
         meta(set_pose(3, 1, 3, 1e6)),
         r"\S+: frame images/003\.png has its camera \S+ times as far from the other cameras as those are .*\.",
@@ -746,13 +738,7 @@ CASES = {
     "quaternion-length",
 )
 @pytest.mark.hard_case(
-    "cameras more than about 8,400 times as far from the origin as they are spread",
-    "refused: float32 cannot tell them apart",
-    "poses-shifted",
-    "json-shifted",
-)
-@pytest.mark.hard_case(
-    "one camera that far from the others",
+    "one camera about 8,400 times as far from the others as these are from each other",
     "refused: remove the image, or compute the poses again",
     "pose-far",
     "json-far",

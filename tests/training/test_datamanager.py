@@ -26,6 +26,7 @@ from runs import blender_data, nerfstudio_data
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data import ply
 from sadgs_ns.data.checks.geometry import check_ply
+from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
@@ -158,6 +159,8 @@ def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
     before = {**json.loads(path.read_text()), **({} if transform is None else {"applied_transform": transform})}
     path.write_text(json.dumps(before))
     metadata = load(parser).train_dataset.metadata  # a question would raise: pytest gives it no terminal
+    of_file = load(dataclasses.replace(parser, data=path)).train_dataset.metadata
+    assert torch.equal(of_file["points3D_xyz"], metadata["points3D_xyz"])
     assert json.loads(path.read_text()) == before and reads == []
     applied = torch.tensor(transform or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=torch.float32)
     create_ply_from_colmap("p.ply", tmp_path / "colmap/sparse/0", tmp_path, applied)  # what it would do after a yes
@@ -224,19 +227,80 @@ def ply_scene(
     text: bool = False,
     colors: np.ndarray | None = COLORS,
     names: Sequence[str] = ("red", "green", "blue"),
+    positions: np.ndarray = POSITIONS,
 ) -> DataParserConfig:
     """A dataset with the points above in a PLY file."""
     parser = nerfstudio_data(folder)
     path = folder / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "points.ply"}))
     kind = [] if colors is None else [(name, colors.dtype.str) for name in names]
-    vertices = np.empty(len(POSITIONS), [(axis, "<f8") for axis in "xyz"] + kind)
+    vertices = np.empty(len(positions), [(axis, "<f8") for axis in "xyz"] + kind)
     for k in range(3):
-        vertices["xyz"[k]] = POSITIONS[:, k]
+        vertices["xyz"[k]] = positions[:, k]
         if colors is not None:
             vertices[names[k]] = colors[:, k]
     PlyData([PlyElement.describe(vertices, "vertex")], text=text).write(str(folder / "points.ply"))
     return parser
+
+
+def move_model(folder: Path, by: np.ndarray, suffix: str = ".bin") -> None:
+    """Move the cameras and points of a COLMAP model, and write it as other files beside the first if asked."""
+    model = colmap_parsing_utils.read_model(str(folder), ".bin")
+    assert model is not None
+    for index, image in model[1].items():
+        model[1][index] = image._replace(tvec=image.tvec - image.qvec2rotmat() @ by)
+    for index, point in model[2].items():
+        model[2][index] = point._replace(xyz=point.xyz + by)
+    colmap_parsing_utils.write_model(*model, str(folder), suffix)
+
+
+@pytest.mark.hard_case(
+    "cameras and points in coordinates of a map (UTM), thousands of kilometres from the origin",
+    "**trains** as well as at the origin, also where float32 has steps of half a metre there",
+)
+@pytest.mark.parametrize("kind", ["a COLMAP model", "a PLY", "an old ns-process-data"])
+def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDataParserConfig, tmp_path: Path):
+    by, applied = np.array([5e5, 5.4e6, 200.0]), np.array([[0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 5.0]])
+    outputs = []
+    for folder, offset in ((tmp_path / "near", 0 * by), (tmp_path / "far", by)):
+        if kind == "a COLMAP model":
+            shutil.copytree(colmap.data, folder)
+            parser: DataParserConfig = dataclasses.replace(colmap, data=folder)
+            move_model(folder / SPARSE_FOLDER, offset)
+        else:
+            parser = ply_scene(folder, colors=None, positions=(POSITIONS + offset) @ applied[:, :3].T + applied[:, 3])
+            described = change_description(folder, applied_transform=applied.tolist())
+            for frame in described["frames"]:
+                pose = np.array(frame["transform_matrix"])
+                pose[:3, 3] += applied[:, :3] @ offset
+                frame["transform_matrix"] = pose.tolist()
+            if kind == "an old ns-process-data":
+                described.pop("ply_file_path")
+                shutil.copytree(colmap.data / SPARSE_FOLDER, folder / "colmap/sparse/0")
+                move_model(folder / "colmap/sparse/0", offset)
+            (folder / "transforms.json").write_text(json.dumps(described))
+        outputs.append(load(parser).train_dataparser_outputs)
+    near, far = outputs
+    torch.testing.assert_close(far.cameras.camera_to_worlds, near.cameras.camera_to_worlds, atol=1e-5, rtol=0)
+    points = [each.metadata["points3D_xyz"] for each in outputs]
+    torch.testing.assert_close(points[1], points[0], atol=1e-5, rtol=0)
+    maps = [Similarity.of(each.dataparser_scale * each.dataparser_transform.double().numpy()) for each in outputs]
+    there, here = (
+        similarity.inverse().positions(found.double().numpy()) for similarity, found in zip(maps, points, strict=True)
+    )
+    np.testing.assert_allclose(here - by, there, atol=1e-4)
+
+
+@pytest.mark.hard_case(
+    "a COLMAP model as text beside another one in binary",
+    "the text is read, with its own points; they were the other's",
+)
+def test_points_are_those_of_the_model_whose_cameras_are_read(colmap: ColmapDataParserConfig, tmp_path: Path):
+    parser = dataclasses.replace(colmap, data=Path(shutil.copytree(colmap.data, tmp_path / "scene")))
+    expected = load(parser).train_dataparser_outputs.metadata["points3D_xyz"]
+    move_model(parser.data / SPARSE_FOLDER, np.array([1.0, 2.0, 3.0]), ".txt")
+    found = load(parser).train_dataparser_outputs.metadata["points3D_xyz"]
+    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("text", [True, False], ids=["text", "binary"])

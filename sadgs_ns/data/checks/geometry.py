@@ -18,8 +18,7 @@ from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warnin
 from sadgs_ns.errors import InputError
 from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
-_FLOAT32_STEP = 2.0**-23  # Distance of a float32 to the next, relative to its size; nerfstudio centres poses in float32
-_FEWEST_STEPS = 1_000  # Steps of float32 that the cameras' spread must have, so that their positions are not too coarse
+_FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, which then have 1,000 float32 steps
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10  # Distance in image sizes at which a principal point is a mistake, and not due to a crop
@@ -28,8 +27,7 @@ NO_COEFFICIENTS = (
     "give one coefficient a tiny value (k1 = 1e-9)."
 )
 """The rest of a sentence about a fisheye camera."""
-_STRONGEST_DISTORTION = 2.0
-"""Quotient of a pixel's distorted and undistorted radius from which on OpenCV's undistortion does not converge."""
+_STRONGEST_DISTORTION = 2.0  # Quotient of distorted and undistorted radius from which OpenCV's undistortion diverges
 
 
 @dataclass(frozen=True)
@@ -114,15 +112,11 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
         yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
     distances, spread = _spread(centres)
-    offset = float(np.linalg.norm(np.median(centres, axis=0)))
-    if spread > 0 and offset * _FLOAT32_STEP * _FEWEST_STEPS > spread:
-        told = f"{source} has its cameras {offset:.3g} units from the origin and only {spread:.3g} apart"
-        yield fault(f"{told}, which float32 cannot tell apart: subtract their centre from all poses and points.")
     far = far_outliers(centres, CAMERA_SHARE)
     if far.any():
         where = and_more(views[int(far.argmax())].where, int(far.sum()))
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
-        is_too_far = distances.max() * _FLOAT32_STEP * _FEWEST_STEPS > spread
+        is_too_far = distances.max() > _FARTHEST * spread
         told = f"{where} has its camera {times}: remove the image from the poses, or compute them again."
         yield (fault if is_too_far else warning)(told)
 
@@ -186,7 +180,7 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
         yield note(f"{path} has points without colours, which start grey.")
 
 
-def check_points(positions: NDArray[np.floating], views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
+def check_points(positions: NDArray[np.float64], views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
     """Count SfM points [P, 3], and check whether the views can see them; `remedy` ends a sentence on broken ones."""
     if not np.isfinite(positions).all():
         yield fault(f"{path} has NaN or infinity in a point: {remedy}.")
@@ -198,8 +192,7 @@ def check_points(positions: NDArray[np.floating], views: Sequence[View], path: P
             yield from _check_distances(positions, views, path)
 
 
-def _check_distances(positions: NDArray[np.floating], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    positions = positions.astype(np.float64)
+def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path: Path) -> Iterator[Finding]:
     far = far_outliers(positions, POINT_SHARE)
     if far.any():
         told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"

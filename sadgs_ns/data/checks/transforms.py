@@ -25,7 +25,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")  # nerfstudio's coefficients,
 _FILES = ("file_path", "mask_path", "depth_file_path")  # Keys with which a frame names files
 _LENS, _PINHOLE = (*_DISTORTION, "distortion_params"), ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _APPLIED = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-"""Default of `applied_transform`, the map [3, 4] from COLMAP's world to that of the poses: older ns-process-data's."""
+"""The map [3, 4] from COLMAP's world to that of the poses of older ns-process-data, which wrote no such map."""
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -118,6 +118,8 @@ def read_transforms(path: Path) -> dict[str, Any]:
         mixed = " and ".join(sorted(models))
         raise InputError(f"{path} mixes the camera models {mixed}: keep the frames of one of them.")
     meta = {name: meta[name] for name in meta if name not in (*_PINHOLE, *_LENS)}
+    if (path.parent / COLMAP_FOLDERS[0]).exists():
+        meta.setdefault("applied_transform", _APPLIED)
     return {**meta, "camera_model": models.pop(), "frames": frames}
 
 
@@ -256,7 +258,7 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
-        positions, transform = colmap.read_points(source)[0], np.array(meta.get("applied_transform", _APPLIED), float)
+        positions, transform = colmap.read_points(source)[0], np.array(meta["applied_transform"], float)
         positions = positions[np.isfinite(positions).all(axis=1)]
         positions = positions @ transform[:, :3].T + transform[:, 3]
         if len(positions):
