@@ -23,11 +23,10 @@ def stub_gsplat(monkeypatch: pytest.MonkeyPatch, per_axis_radii: bool) -> None:
         width: int, height: int, *, near_plane: float, **bound: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         assert bound.keys() == ({"opacities"} if per_axis_radii else set())
-        means2d, depths, conics, covars2d, valid = backend_torch._project(
-            means, quats, scales, viewmats, Ks, width, height, near_plane
+        opacities = bound.get("opacities", means.new_ones(len(means)))
+        radii, means2d, depths, conics = project(
+            means, quats, scales, opacities, viewmats, Ks, width, height, near_plane
         )
-        opacities = bound.get("opacities", means.new_ones(len(means))).expand(depths.shape)
-        radii = backend_torch._radii(means2d, covars2d, opacities, valid, width, height)
         drawn = gsplat_compat.drawn(radii, means2d)[..., None]
         # The kernel does not write what it culls.
         conics = torch.where(drawn, conics, torch.nan)
@@ -53,6 +52,18 @@ def stub_gsplat(monkeypatch: pytest.MonkeyPatch, per_axis_radii: bool) -> None:
     stubs = (fully_fused_projection, spherical_harmonics, isect_tiles, isect_offset_encode, rasterize_to_pixels)
     for function in stubs:
         monkeypatch.setattr(gsplat, function.__name__, function)
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+    width: int, height: int, near_plane: float = 0.01,
+) -> tuple[Tensor, ...]:  # fmt: skip
+    """`gsplat_compat.project`, with radii as the torch backend has them."""
+    means2d, depths, conics, covars2d, valid = backend_torch._project(
+        means, quats, scales, viewmats, Ks, width, height, near_plane
+    )
+    radii = backend_torch._radii(means2d, covars2d, opacities.expand(depths.shape), valid, width, height)
+    return radii, means2d, depths, conics
 
 
 def rasterize_to_pixels(

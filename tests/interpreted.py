@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-from gsplat_stub import rasterize_to_pixels
+from gsplat_stub import project, rasterize_to_pixels
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
@@ -15,23 +14,6 @@ compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton is not installed")
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
-
-
-def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    near_plane: float = 0.01,
-) -> tuple[Tensor, ...]:
-    """`gsplat_compat.project` in torch."""
-    covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
-    assert covariances is not None
-    return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, near_plane=near_plane)[:4]
 
 
 def composite(

@@ -45,8 +45,8 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first. On CUDA fewer are
-    added, with a warning, if the device's memory cannot hold more."""
+    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
+    On CUDA fewer are added, with a warning, if the device's memory cannot hold more."""
     structure_every: int | None = None
     """Iterations between structure-aware split and prune steps; None is a sixth of the run, 0 turns them off."""
     absgs_every: int | None = None
@@ -58,8 +58,8 @@ class StructureAwareStrategy(Strategy):
     """Last iteration at which densification may run; Gaussians less than 0.1 opaque are pruned there.
     None is 16/30 of the run, and 19/30 are the most; 0 adds and removes none at all."""
     eta_every: int | None = None
-    """Iterations between η observations; None is a three-hundredth of the run. The paper observes at every iteration,
-    which takes time and improves nothing."""
+    """Iterations between η observations; None is a three-hundredth of the run.
+    The paper observes at every iteration, which takes time and improves nothing."""
     tau_split: float = 0.8
     """Fraction of a Gaussian's observations that must violate (η > 1) before an axis is split."""
     min_observations: int = 3

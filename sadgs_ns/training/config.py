@@ -96,11 +96,11 @@ class SadgsModelConfig(InstantiateConfig):
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; 0 leaves it the last iteration's."""
     max_off_axis: float = 4.0
-    """Gaussians whose centre is projected farther than this from the image's centre, in half images along x or y, are
-    not drawn. Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
+    """Gaussians whose centre is projected farther than this from the image's centre, in half images, are not drawn.
+    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
     near_plane: float | None = None
-    """Depth from which Gaussians are drawn, in training and later, in the run's units. None is half the depth of the
-    fifth nearest SfM point of a training camera, the smallest of all cameras."""
+    """Depth from which Gaussians are drawn, in training and later, in the run's units.
+    None is half the depth of the fifth nearest SfM point of a training camera, the smallest of all cameras."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
@@ -181,8 +181,8 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     effort: float = 1.0
-    """How much training the capture gets, relative to what its number of views asks for. 0.5 is a draft of half as many
-    renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
+    """How much training the capture gets, relative to what its number of views asks for.
+    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -221,8 +221,8 @@ class SadgsMachineConfig(MachineConfig):
     seed: int = 42
     """Seed of everything that is drawn at random, the order of the training views too."""
     num_devices: int = 1
-    """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out. torchrun can start
-    the processes instead, also on several machines; then this is 1."""
+    """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
+    torchrun can start the processes instead, also on several machines; then this is 1."""
     device_type: Literal["cpu", "cuda"] = field(  # type: ignore[assignment]
         default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
     )

@@ -104,7 +104,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SadgsTraine
 def test_the_harmonics_are_gsplat_s_and_orthonormal():
     basis = spherical_harmonics(directions(), 3)
     for band in range(16):
-        coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None]
+        coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None].expand(-1, -1, 3)
         theirs = _spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
         np.testing.assert_allclose(basis[:, band], theirs, atol=2e-14)
     identity = Similarity(1.0, np.eye(3), np.zeros(3)).harmonics(3)

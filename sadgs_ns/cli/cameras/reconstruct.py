@@ -199,7 +199,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
 
     def attempt(stage: str, limits: dict[str, float]) -> pycolmap.Reconstruction | None:
-        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, **_ADJUSTMENT, **others)
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **others)
         options.mapper.mergedict({"ba_local_num_images": _ADJUSTED_PHOTOS, **limits})
         registered = 0 if before is None else before.num_reg_frames()
 
@@ -244,6 +244,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     for frame_id, frame in before.frames.items() if before else ():  # COLMAP rounds poses that it holds fixed.
         if frame.has_pose:
             best.frames[frame_id].rig_from_world = frame.rig_from_world
+    best.extract_colors_for_all_images(photos)  # Otherwise a point has one photo's colour, or none.
     partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
     check_written(partial, best)
