@@ -620,12 +620,29 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     assert told == [
         "Left out as thumbnails or trash: 3, such as #recycle/old.jpg.",
         "Left out as depth or other maps: 3, such as Confidence/b.png.",
-        "Left out as copies of others: 5, such as images/a (1).jpg.",
+        "Left out as copies of others: 5, such as images_2/a.jpg.",
         "Left out as masks of no photo: 1, such as masks/none.png.",
     ]
     (tmp_path / "out" / "work").mkdir(parents=True)
     (tmp_path / "out" / "work" / "settings.json").write_text(json.dumps({"photos": [*left, "images/b.jpg"]}))
     assert look_into(tmp_path, tmp_path / "out")[0] == sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
+
+
+@pytest.mark.hard_case(
+    "photos `room (1).jpg`, `room (2).jpg`, as Windows renames them, that look alike, and their masks",
+    "are no copies of each other, and each has its own mask",
+)
+def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp_path: Path):
+    (tmp_path / "masks").mkdir()
+    view = next(draw_photos()).filter(ImageFilter.GaussianBlur(3))
+    for i in range(1, 4):
+        view.rotate(0.1 * i).resize((160 + 40 * i, 120 + 30 * i)).save(tmp_path / f"room ({i}).jpg")
+        Image.new("L", view.size, 255).save(tmp_path / "masks" / f"room ({i}).png")
+    shutil.copy(tmp_path / "room (1).jpg", tmp_path / "room (9).jpg")
+    names = [f"room ({i}).jpg" for i in range(1, 4)]
+    masks = {name: f"masks/{Path(name).stem}.png" for name in names}
+    told = ["Left out as copies of others: 1, such as room (9).jpg."]
+    assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
 
 
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")
@@ -755,10 +772,11 @@ def test_a_focal_length_that_no_lens_has_is_unknown(tags: dict[int, Any], expect
 
 
 @pytest.mark.hard_case("a phone's photos with and without digital zoom, of one lens", "have a camera each")
-def test_digital_zoom_is_another_camera(tmp_path: Path):
+@pytest.mark.parametrize("tags", [{0xA405: 52}, {0xA404: IFDRational(2, 1)}, {0xA405: 52, 0xA404: IFDRational(2, 1)}])
+def test_digital_zoom_is_another_camera(tags: dict[int, Any], tmp_path: Path):
     for i in range(4):
         exif = Image.Exif()
-        exif[0x8769] = {0x920A: IFDRational(42, 10), 0xA405: 26 + 26 * (i // 2)}
+        exif[0x8769] = {0x920A: IFDRational(42, 10), 0xA405: 26, 0xA404: IFDRational(1, 1)} | (tags if i > 1 else {})
         Image.new("RGB", (8, 8)).save(tmp_path / f"{i}.jpg", exif=exif)
     read = read_photos(tmp_path, [f"{i}.jpg" for i in range(4)], lambda *step: None)
     assert photos_by_camera(read) == [["0.jpg", "1.jpg"], ["2.jpg", "3.jpg"]]

@@ -31,8 +31,8 @@ _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|los
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
-_VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small|\(\d+\))$")
-"""Additions to a photo's name for its mask or a copy; an iPhone's IMG_E1234 is the edited IMG_1234."""
+_VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small)$")
+"""Additions to a photo's name for its mask or a copy (IMG_E1 is the edited IMG_1), not the (1), (2) of Windows."""
 
 
 def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str], list[str]]:

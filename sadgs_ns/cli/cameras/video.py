@@ -1,7 +1,4 @@
-"""Photos from videos: the sharpest frame of each stretch.
-
-Functions import PyAV and OpenCV, which `sadgs` need not wait for where there is no video.
-"""
+"""Photos from videos: the sharpest frame of each stretch. PyAV and OpenCV are imported only if there is a video."""
 
 from __future__ import annotations
 
