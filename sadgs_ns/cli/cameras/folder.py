@@ -177,8 +177,7 @@ def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list
         pixels = {name: math.prod(image_size(folder / name)) for name in names}
         names.sort(key=lambda name: (name not in known, -pixels[name]))
         for i, name in enumerate(names):
-            others = (folder / other for other in names[:i] if other not in copies)
-            if name not in {*known, *copies} and any(_is_copy(folder / name, other) for other in others):
+            if name not in {*known, *copies} and any(_is_copy(folder / name, folder / other) for other in names[:i]):
                 copies.append(name)
     return copies
 
