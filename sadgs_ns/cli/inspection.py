@@ -97,8 +97,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
     if training:  # Poses may be learned.
         camera = camera._replace(viewmats=pipeline.views.viewmat(index)[None])
     structure_tensor = dequantize(next(pipeline.structure_cache.quantized([data])))
-    name = dataset.image_filenames[index].name
-    return View(name, pipeline.structure_cache.photo(data), structure_tensor, camera)
+    return View(dataset.image_filenames[index].name, pipeline.structure_cache.photo(data), structure_tensor, camera)
 
 
 def screen_gradients(pipeline: SadgsPipeline, progress: Callable[[range], Iterable[int]] = iter) -> dict[str, Tensor]:

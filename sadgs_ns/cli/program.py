@@ -33,8 +33,7 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
         print(f"{name} {version('sadgs_ns')}")
         raise SystemExit(0)
     description = f"{' '.join((options.__doc__ or '').split())} --version prints the version."
-    config = (tyro.conf.FlagCreatePairsOff,)
-    return tyro.cli(options, prog=name, description=description, args=words, config=config)
+    return tyro.cli(options, prog=name, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,))
 
 
 def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:

@@ -161,8 +161,7 @@ class PhotosToSplat:
                 self._settings |= {"views": None, "trained": None, "run": f"run-{int(time.time())}"}
             self._note()
             # Meanwhile it imports what training needs.
-            needs_training = not self._trained() or self._added
-            self._trainer = self.worker("training", _TRAINING) if needs_training else None
+            self._trainer = self.worker("training", _TRAINING) if self._added or not self._trained() else None
             for name, stage in STAGES.items():
                 self.timeline.begin(*_FIRST_PARTS.get(name, (name, name)))
                 with StatusLine(name, self.console) as line:

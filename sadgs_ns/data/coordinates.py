@@ -16,8 +16,7 @@ from sadgs_ns.errors import InputError, reason
 
 Array = NDArray[np.float64]
 
-TRANSFORMS_NAME = "dataparser_transforms.json"
-"""Name of the file in which nerfstudio's trainer writes, beside `config.yml`, how it moved cameras and points."""
+TRANSFORMS_NAME = "dataparser_transforms.json"  # In it nerfstudio's trainer notes how it moved the capture
 FRAME_KEYS = ("dataparser_transform", "dataparser_scale")
 """Keys of a `transforms.json` that fix how its data is moved, so that adding photos leaves the frame of training."""
 _TOLERANCE = 1e-4  # Largest deviation from a similarity of a transform in float32, relative to its scale

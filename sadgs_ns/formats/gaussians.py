@@ -15,8 +15,7 @@ DEGREE_0 = 0.5 / np.sqrt(np.pi)  # The spherical harmonic of degree 0
 _ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that float64 takes little memory
 
 Array = NDArray[np.float32]
-Frame = Literal["nerfstudio", "colmap"]
-"""Coordinates: nerfstudio's, in which z is up, or those of the COLMAP model, in which y mostly is down."""
+Frame = Literal["nerfstudio", "colmap"]  # nerfstudio's coordinates, where z is up, or COLMAP's, where y mostly is down
 
 
 @dataclass(frozen=True)

@@ -98,8 +98,7 @@ def _places(points: Tensor, viewmat: Tensor, depths: DepthMap) -> tuple[Tensor, 
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = in_camera[:, 2]
     size = points.new_tensor([depths.depth.shape[1], depths.depth.shape[0]])
-    pixels = in_camera[:, :2] / depth[:, None] * depths.K.diagonal()[:2] + depths.K[:2, 2]
-    return depth, pixels / size
+    return depth, (in_camera[:, :2] / depth[:, None] * depths.K.diagonal()[:2] + depths.K[:2, 2]) / size
 
 
 def _read(values: Tensor, places: Tensor) -> Tensor:

@@ -61,8 +61,7 @@ class StepSize:
     pairs: float = 0
     """Number of pairs of a Gaussian and a tile that it reaches, in all views, with the places of tile lists that a step
     left unused because their length was foreseen (render/tile_forecast.py)."""
-    exchanged: bool = False
-    """Whether several processes share the step out; pixels and pairs are then those of one of them."""
+    exchanged: bool = False  # Whether processes share the step out; pixels and pairs are then those of one.
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:

@@ -9,8 +9,7 @@ from sadgs_ns.kernels import use_triton
 
 INVALID = 255  # Second byte of a pixel whose S̄ is NaN, such as a masked one; those of correlations end at 254
 HIGHEST_FREQUENCY = 4.0  # 1/px. S̄'s trace is at most c²/px², so this is the largest c that can be stored
-OCTAVES = 12.0
-"""Frequencies from 2⁻¹² of the highest one on, wavelengths of 0.25 to 1,024 px, are told apart; lower ones become 0."""
+OCTAVES = 12.0  # Frequencies from 2⁻¹² of the highest one on, so wavelengths of 0.25 to 1,024 px, are told apart.
 
 
 def quantize(

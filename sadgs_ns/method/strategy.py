@@ -22,15 +22,12 @@ from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradien
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
-Infos = Info | Sequence[Info]
-"""gsplat's info of the views of a step, or a list with one info for each image size."""
+Infos = Info | Sequence[Info]  # gsplat's info of the views of a step, or a list with one for each image size
 _WINDOWS = tuple(field.name for field in fields(Windows))
 
-TAU_PRUNE = 0.8
-"""τ_prune: fraction of observations that must be low on every axis to prune a faint Gaussian (paper, section 3.4)."""
+TAU_PRUNE = 0.8  # τ_prune: share of observations that must be low on every axis to prune a faint Gaussian (section 3.4)
 PRUNE_OPACITY = 0.1  # τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)
-CLAMP_OPACITY = 0.8
-"""Structure steps lower opacities to at most this, so that Gaussians behind get gradients again (released code)."""
+CLAMP_OPACITY = 0.8  # Structure steps lower opacities to this, so that Gaussians behind get gradients (released code).
 RESET_FACTOR = 0.1  # Factor of an opacity reset on every opacity (released code)
 FINAL_PRUNE_OPACITY = 0.1  # Opacity under which Gaussians are pruned when densification ends (released code)
 

@@ -15,8 +15,7 @@ from sadgs_ns.data import colmap
 from sadgs_ns.data.checks.images import Rounding, images_in
 from sadgs_ns.errors import InputError
 
-COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")
-"""Folders in which a reconstruction is looked for; nerfstudio's default is the first."""
+COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")  # Places of a reconstruction, nerfstudio's first
 _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
     "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse"
@@ -34,8 +33,7 @@ _EXPORTS = {
     "bundle.out": (b"# Bundle", _BUNDLER),
 }
 """Files with other programs' poses, a part of their content, and the command that reads them."""
-GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"
-"""Remedy where poses are missing, as the end of a sentence."""
+GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"  # A remedy where there are none
 
 
 @dataclass(frozen=True)

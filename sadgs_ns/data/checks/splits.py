@@ -14,10 +14,8 @@ from sadgs_ns.data.checks.findings import Finding, and_more, warning
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.errors import InputError
 
-SPLITS = ("train", "val", "test")
-"""Parts of the images: nerfstudio trains on the first, `ns-train` measures the second, and `ns-eval` the third."""
-_SHELL = set('"$`\\')
-"""Characters that a shell acts on within double quotes; nerfstudio puts names between such when it runs ffmpeg."""
+SPLITS = ("train", "val", "test")  # nerfstudio trains on the first, `ns-train` measures the second, `ns-eval` the third
+_SHELL = set('"$`\\')  # A shell acts on them in double quotes, between which nerfstudio names files to ffmpeg.
 
 
 def check_splits(
