@@ -106,6 +106,8 @@ def export(options: Export) -> int:
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
     similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
     params, drawing = read_checkpoint(options.run)
+    if similarity is not None:
+        _check_steps(similarity, float(params["scales"].median()))
     cameras = start = None
     if is_page or is_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
@@ -130,6 +132,15 @@ def _check(options: Export) -> None:
         raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
     if voxel_size is not None and not 0 < voxel_size < math.inf:
         raise InputError(f"--voxel-size {voxel_size:g} must be more than 0: leave it out to have it derived.")
+
+
+def _check_steps(similarity: Similarity, log_size: float) -> None:
+    """Raise InputError if float32, in which files hold positions, has larger steps in a frame than Gaussians' size."""
+    place = float(np.abs(similarity.translation).max())
+    step = float(np.spacing(np.float32(place)))
+    if step > similarity.scale * math.exp(log_size):
+        told = f"--frame colmap puts the splat {place:.3g} units from the origin, where float32 has steps of {step:.2g}"
+        raise InputError(f"{told}: leave it out, and place the file by the transform in the run's {TRANSFORMS_NAME}.")
 
 
 def _cleaned(

@@ -533,6 +533,7 @@ def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys
         ("shear", r".*transforms\.json does not tell .* \(it is no rotation, scale and translation\): copy .*\."),
         ("not json", r".*transforms\.json does not tell how to return to the data's frame \(.*\): copy it .*\."),
         ("nan", r".*transforms\.json does not tell .*\): copy it from the run again, or export in .*\."),
+        ("far", r"--frame colmap puts the splat 1e\+08 units from .*, where float32 has steps of 8: leave it .*\."),
         ("suffix", r"--output .*a\.splat must end in \.ply, \.compressed\.ply, .* or \.mesh\.ply\."),
         ("folder", r"--output .*a\.ply is a folder: name a file in it\."),
     ],
@@ -549,6 +550,7 @@ def test_errors_are_one_sentence_and_leave_nothing(
         params["features_rest"] = torch.zeros(3, 24, 3)
     transform = np.eye(3, 4)
     transform[0, 1] = {"shear": 0.1, "nan": np.nan}.get(case, 0.0)
+    transform[0, 3] = 1e8 if case == "far" else 0.0
     run = write_run(tmp_path / "run", params, None if case == "no transform" else transform)
     checkpoint = run / "nerfstudio_models" / "step-000000007.ckpt"
     if case == "not json":
