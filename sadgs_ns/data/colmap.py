@@ -27,8 +27,7 @@ CAMERA_PARAMETERS = {
 """Number of parameters of each of COLMAP's camera models, in the order of the models' numbers."""
 
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]  # Positions [P, 3] and colours in 0 … 255 [P, 3]
-Pose = tuple[str, int, NDArray[np.float64]]
-"""An image's name, its camera's id and its pose: wxyz quaternion and translation, world to camera [7]."""
+Pose = tuple[str, int, NDArray[np.float64]]  # Name, camera's id, wxyz quaternion and translation, world to camera [7]
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,7 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
             problem = f"camera {camera_id} has COLMAP's model {model_id}, which nerfstudio does not know: undistort the"
             raise InputError(f"{path}: {problem} images with `colmap image_undistorter`, or copy it again if damaged.")
         model = list(CAMERA_PARAMETERS)[model_id]
-        params = file.take(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d"))
-        yield camera_id, Camera(model, width, height, params)
+        yield camera_id, Camera(model, width, height, file.take(struct.Struct(f"<{CAMERA_PARAMETERS[model]}d")))
 
 
 def _read_binary_poses(path: Path) -> Iterator[Pose]:

@@ -79,11 +79,9 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
     elif layout == "colmap":
-        options = automatic_options(data)
-        config.dataparser = ColmapDataParserConfig(
-            data=data, colmap_path=options.colmap_path, images_path=options.images_path,
-            downscale_factor=options.downscale_factor,
-        )  # fmt: skip
+        known = {field.name for field in fields(ColmapDataParserConfig)}
+        options = {name: value for name, value in vars(automatic_options(data)).items() if name in known}
+        config.dataparser = ColmapDataParserConfig(data=data, **options)
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)
 
@@ -222,9 +220,8 @@ def _move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path:
     if "points3D_xyz" in metadata:
         points = metadata["points3D_xyz"].double().numpy()
         metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(chosen.inverse().positions(points))).float()
-    transform, scale = (meta[name] for name in FRAME_KEYS)
-    outputs.dataparser_transform = torch.tensor(transform, dtype=outputs.dataparser_transform.dtype)
-    outputs.dataparser_scale = float(scale)
+    outputs.dataparser_transform = torch.tensor(meta[FRAME_KEYS[0]], dtype=outputs.dataparser_transform.dtype)
+    outputs.dataparser_scale = float(meta[FRAME_KEYS[1]])
 
 
 def points_in_the_run(

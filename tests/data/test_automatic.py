@@ -26,7 +26,7 @@ from PIL import Image
 from runs import blender_data, configure, nerfstudio_data, train
 from scenes import HEIGHT, VIEWS, WIDTH
 
-from examples.drawn_scene.scene import SPARSE_FOLDER
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.parsers import AutomaticDataParserConfig, check_capture, choose_parser
 from sadgs_ns.errors import InputError
@@ -278,6 +278,28 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
         assert note.endswith("PNG RGB, without masks.") == (factor == 4)
         if factor == 1:
             shutil.rmtree(smaller)
+
+
+@pytest.mark.hard_case(
+    "smaller copies whose sides were rounded to the nearest or up, as Mip-NeRF 360's",
+    "**train** where no parser is named; they were refused as of another size",
+)
+@pytest.mark.parametrize("rounding", ["floor", "round", "ceil"])
+def test_smaller_copies_are_read_as_they_were_rounded(rounding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    write_scene(tmp_path / "scene", 49, 38, 10, 60)  # A fourth is 12.25 and 9.5 px.
+    size = {"floor": (12, 9), "round": (12, 10), "ceil": (13, 10)}[rounding]
+    for folder, copy_size in (("images_2", (24, 19)), ("images_4", size)):
+        (tmp_path / "scene" / folder).mkdir()
+        for path in (tmp_path / "scene/images").iterdir():
+            with Image.open(path) as image:
+                image.resize(copy_size).save(tmp_path / "scene" / folder / path.name)
+    assert [finding for finding in check_data(tmp_path / "scene") if finding.severity != "note"] == []
+    config = SadgsDatamanagerConfig(data=tmp_path / "scene")
+    datamanager = config.setup(device="cpu")
+    assert {tuple(data["image"].shape[1::-1]) for data in datamanager.cached_train} == {size}
+    cameras = datamanager.train_dataset.cameras
+    assert {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)} == {size}
 
 
 @pytest.mark.hard_case(

@@ -555,8 +555,8 @@ NERFSTUDIO = {
         r"\S+ has an applied_transform that is not 3 × 4 finite numbers: correct or remove it\.",
     ),
     "json-applied-scale": (
-        meta(lambda m: m.update(applied_scale=0)),
-        r"\S+ has applied_scale = 0, which must be positive: correct it\.",
+        meta(lambda m: m.update(applied_scale=3)),
+        r"\S+ has applied_scale = 3, by which nerfstudio moves points and no cameras: remove it\.",
     ),
     "json-orientation": (
         meta(lambda m: m.update(orientation_override="upside down")),
@@ -901,7 +901,7 @@ CASES = {
     "EXIF orientation 6, and poses of the upright images", "refused by that tag", "image-orientation"
 )
 @pytest.mark.hard_case(
-    "`applied_transform` of another shape; `applied_scale` of 0, NaN or text; an unknown "
+    "`applied_transform` of another shape; `applied_scale` that is not 1, which moves points away; an unknown "
     "`orientation_override`; `fisheye_crop_radius` of text",
     "refused by name",
     "json-applied-transform",
@@ -1114,6 +1114,36 @@ def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]
     assert re.fullmatch(r"\S+/p\.ply has points that no camera can see in front of it: .*\.", sentence)
     (sentence,) = check()
     assert re.fullmatch(r"\S+/p\.ply holds no SfM point: restore it, or leave .*\.", sentence)
+
+
+@pytest.mark.hard_case(
+    "a Blender scene far from the origin, in mm or in km, where its poses stay and random points are 10 units wide",
+    "a warning: rename the file to `transforms.json`, whose cameras are centred and scaled",
+)
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 60.0), (100.0, 0.0), (0.01, 0.0)])
+def test_a_blender_scene_whose_random_points_no_camera_sees_is_told(
+    scale: float, offset: float, copied: Callable[[str], Path]
+):
+    data = copied("blender")
+
+    def told() -> list[str]:
+        return [finding.sentence for finding in check_data(data) if finding.severity == "warning"]
+
+    def move(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] = scale * row[3] + offset
+
+    assert told() == []
+    meta(move, "transforms_train.json")(data)
+    (sentence,) = told()
+    assert re.fullmatch(
+        r"\S+/transforms_train\.json has cameras \S+ units from the origin, about which random points fill a cube of "
+        r"side 10 as training starts: rename it to transforms\.json, whose cameras are centred and scaled\.",
+        sentence,
+    )
+    (data / "transforms_train.json").rename(data / "transforms.json")
+    assert errors(data) == []
 
 
 @pytest.mark.hard_case("one point 10⁵ to 10²⁰⁰ units away", "trains as without it; the run says how many it leaves out")

@@ -145,12 +145,15 @@ def automatic_options(data: Path) -> ParserOptions:
     Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
     that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
     """
-    (model, names), factor = next(iter(layouts.find_reconstructions(data).items())), 1
+    model, names = next(iter(layouts.find_reconstructions(data).items()))
     folder = layouts.images_folder(data, model, names) or Path("images")
-    if names and folder != Path():  # The smaller copies of images right in the capture would lie outside of it.
-        copies = data / folder
-        factor = images.automatic_factor(copies / names[0], lambda by: images.smaller_folder(copies, by) / names[0])
-    return ParserOptions(images_path=folder, colmap_path=model, downscale_factor=factor, eval_mode="interval")
+    options = ParserOptions(images_path=folder, colmap_path=model, downscale_factor=1, eval_mode="interval")
+    if not names or folder == Path():  # The smaller copies of images right in the capture would lie outside of it.
+        return options
+    image, copies = data / folder / names[0], lambda by: images.smaller_folder(data / folder, by) / names[0]
+    factor = images.automatic_factor(image, copies)
+    rounding = images.rounding_of(image, copies(factor), factor)
+    return dataclasses.replace(options, downscale_factor=factor, downscale_rounding_mode=rounding)
 
 
 def _camera(camera: colmap.Camera, where: str) -> Camera:

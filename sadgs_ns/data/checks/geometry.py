@@ -132,8 +132,7 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
     angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
     if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
         focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
-        is_likely = _NARROWEST <= angle <= _WIDEST
-        yield (warning if is_likely else fault)(f"{where} has {focal}: correct it, in pixels.")
+        yield (warning if _NARROWEST <= angle <= _WIDEST else fault)(f"{where} has {focal}: correct it, in pixels.")
     if not 0.5 <= camera.fx / camera.fy <= 2:
         focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
         yield warning(f"{where} has {focals}: correct them, in pixels.")

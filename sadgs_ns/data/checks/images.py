@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
@@ -58,6 +58,12 @@ def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
     width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
     to_int = {"floor": math.floor, "round": lambda value: math.floor(value + 0.5), "ceil": math.ceil}[rounding]
     return to_int(width), to_int(height)
+
+
+def rounding_of(image: Path, copy: Path, factor: int) -> Rounding:
+    """Return how the sides of an image's smaller copy were rounded; "floor", nerfstudio's default, if none fits."""
+    fitting = (mode for mode in get_args(Rounding) if scaled_size(image_size(image), factor, mode) == image_size(copy))
+    return next(fitting, "floor")
 
 
 def smaller_folder(folder: Path, factor: int) -> Path:
@@ -172,9 +178,8 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
     of_size = f"{width} × {height} px" + (" and other sizes" if len(sizes) > 1 else "")
     of_kind = ", ".join(f"{kind} ({count})" if len(kinds) > 1 else kind for kind, count in kinds.most_common())
     masked = sum(mask is not None for mask in masks)
-    text = (
-        f"{source} has {len(images)} images of {of_size}, {of_kind}, {f'with {masked}' if masked else 'without'} masks."
-    )
+    count = f"with {masked}" if masked else "without"
+    text = f"{source} has {len(images)} images of {of_size}, {of_kind}, {count} masks."
     if max(map(max, sizes)) > MAX_AUTO_RESOLUTION:
         half = "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution"
         text += f" Images of more than {MAX_AUTO_RESOLUTION} px take long: {half}."

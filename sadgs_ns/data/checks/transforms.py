@@ -94,6 +94,11 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
         if split == "train":
             sound = yield from geometry.check_views(views, len(views), path)
+            distance = float(np.median([np.linalg.norm(view.centre) for view in views]))
+            if options.ply_path is None and not 0.5 < distance < 25:
+                told = f"{path} has cameras {distance:.3g} units from the origin, about which random points fill a cube"
+                remedy = "rename it to transforms.json, whose cameras are centred and scaled"
+                yield warning(f"{told} of side 10 as training starts: {remedy}.")
             if options.ply_path is not None:
                 remedy = "restore it, or leave `--ply-path` out to start from random points"
                 yield from geometry.check_ply(data / options.ply_path, views if sound else [], remedy)
@@ -139,8 +144,7 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
     if "fl_x" in values:
         values.setdefault("fl_y", values["fl_x"])
     lens = frame if any(name in frame for name in _LENS) else meta
-    taken = {n: values[n] for n in _PINHOLE if n in values} | {n: lens[n] for n in _LENS if n in lens}
-    return taken | files
+    return {n: values[n] for n in _PINHOLE if n in values} | {n: lens[n] for n in _LENS if n in lens} | files
 
 
 def mended_name(folder: Path, name: str) -> str:
@@ -171,8 +175,9 @@ def _check_transform(meta: dict[str, Any], path: Path) -> None:
     """Raise InputError if the settings of all poses together make no sense."""
     if (applied := _rows_of_four(meta.get("applied_transform", _APPLIED), 3)) is None or not np.isfinite(applied).all():
         raise InputError(f"{path} has an applied_transform that is not 3 × 4 finite numbers: correct or remove it.")
-    if geometry.finite(meta.get("applied_scale", 1), "applied_scale", str(path)) <= 0:
-        raise InputError(f"{path} has applied_scale = {meta['applied_scale']}, which must be positive: correct it.")
+    if geometry.finite(meta.get("applied_scale", 1), "applied_scale", str(path)) != 1:
+        told = f"{path} has applied_scale = {meta['applied_scale']}, by which nerfstudio moves points and no cameras"
+        raise InputError(f"{told}: remove it.")
     fixed_frame(meta, path)
     if meta.get("fisheye_crop_radius") is not None:
         geometry.finite(meta["fisheye_crop_radius"], "fisheye_crop_radius", str(path))
@@ -259,9 +264,7 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
         positions, transform = colmap.read_points(source)[0], np.array(meta["applied_transform"], float)
-        positions = positions[np.isfinite(positions).all(axis=1)]
         positions = positions @ transform[:, :3].T + transform[:, 3]
-        if len(positions):
-            yield from geometry.check_points(positions, views, source, "run COLMAP's mapper again")
+        yield from geometry.check_points(positions, views, source, "run COLMAP's mapper again")
     else:
         yield note(f"{path} has no ply_file_path: training will start from random points.")
