@@ -946,6 +946,20 @@ def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
     assert [finding for finding in check_data(captures / layout) if finding.severity != "note"] == []
 
 
+@pytest.mark.hard_case("views from a tripod, in one place but for rounding, and one beside it", "no warning")
+def test_views_from_a_tripod_are_as_good_as_others(copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+
+    def move(content: dict[str, Any]) -> None:
+        in_one_place(content)
+        for index, frame in enumerate(content["frames"]):
+            frame["transform_matrix"][0][3] += 1e-15 * index + 0.3 * (index == 5)
+
+    meta(move)(data)
+    with_points([[0.5, 0.5, 0.5]] * 4)(data)
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+
+
 def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

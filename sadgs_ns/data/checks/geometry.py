@@ -111,14 +111,13 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     if len(centres) > 1 and largest <= 1e-9 * max(np.abs(centres).max(), 1.0):
         yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
-    distances, spread = _spread(centres)
+    _, distances, spread = _spread(centres)
     far = far_outliers(centres, CAMERA_SHARE)
-    if far.any():
+    if spread > 0 and far.any():
         where = and_more(views[int(far.argmax())].where, int(far.sum()))
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
-        is_too_far = distances.max() > _FARTHEST * spread
         told = f"{where} has its camera {times}: remove the image from the poses, or compute them again."
-        yield (fault if is_too_far else warning)(told)
+        yield (fault if distances.max() > _FARTHEST * spread else warning)(told)
 
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
@@ -197,8 +196,7 @@ def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path
         told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
         yield note(f"{path} has {told}: training leaves them out.")
     positions = positions[~far]
-    centres = np.stack([view.centre for view in views])  # [V, 3]
-    middle, (_, spread) = np.median(centres, axis=0), _spread(centres)
+    middle, _, spread = _spread(np.stack([view.centre for view in views]))
     distance = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     remedy = "take points and poses of one reconstruction, in the same units and axes"
     if spread > 0 and distance > 1e3 * spread:
@@ -228,7 +226,9 @@ def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[
     return seeing / len(views)
 
 
-def _spread(centres: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the distances [V] of centres [V, 3] from their median, and the one within which most lie, but not all."""
-    distances = np.linalg.norm(centres - np.median(centres, axis=0), axis=1)
-    return distances, float(np.quantile(distances, CAMERA_SHARE, method="lower"))
+def _spread(centres: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the median of centres [V, 3], their distances from it [V], and the one within which most lie, not all."""
+    middle = np.median(centres, axis=0)
+    distances = np.linalg.norm(centres - middle, axis=1)
+    spread = float(np.quantile(distances, CAMERA_SHARE, method="lower"))
+    return middle, distances, spread if spread > 1e-9 * np.abs(middle).max() else 0.0  # A tripod's is rounding.
