@@ -47,7 +47,7 @@ def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int)
     """Return the numbers of the views with rows that a process composites, in its order.
 
     `sizes` are height and width of each view in px; views of one size are shared out together. Results are kept,
-    because those who look ahead ask for many steps, most of them alike.
+    because looking ahead asks for many steps, and most are alike.
     """
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, size in enumerate(sizes):

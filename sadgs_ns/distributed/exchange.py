@@ -1,4 +1,4 @@
-"""Projected Gaussians on their way to the processes that composite them, and their gradients on the way back."""
+"""Send projected Gaussians to the processes that composite them, and their gradients back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which Gaussians may grow under one cap, in one process or several."""
+"""Choose which Gaussians may grow under one cap, in one process or several."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ SWITCH = "SADGS_TRITON"  # Environment variable; 0 keeps a process from using th
 
 _forced: bool | None = False if os.environ.get(SWITCH) == "0" else None  # Of `use_triton`; None: the device decides.
 _working: set[torch.device] = set()  # Devices on which a kernel has run
-_asked: Counter[torch.device] = Counter()  # Questions to `available` about a device on which no kernel had run
+_asked: Counter[torch.device] = Counter()  # Calls of `available` for a device on which no kernel had run
 
 
 def cdiv(number: int, block: int) -> int:
@@ -68,8 +68,8 @@ def available(device: torch.device) -> bool:
     """Return whether the kernels run on a device.
 
     It must be CUDA's current device, on which Triton launches any tensors, and Triton must compile for it, which needs
-    a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. As
-    a failure may pass, it is tried again at the 2nd, 4th, 8th, … question. Only the first failure warns.
+    a C compiler, Python's headers and a GPU that Triton knows. One small kernel is tried, and success is remembered. A
+    failure may pass, so it is tried again at the 2nd, 4th, 8th, … call. Only the first failure warns.
     """
     if device.type != "cuda" or device.index not in (None, torch.cuda.current_device()):
         return False

@@ -1,6 +1,7 @@
 """The three operations of `method.structure_tensor`.
 
-For such long kernels cuDNN takes several times as long, and torch needs forty launches for the rest of a level.
+With such long convolution kernels cuDNN takes several times as long, and torch needs forty launches for the rest of a
+level.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ def _load_ellipse(
     means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """Load what decides which tiles the Gaussians with indices g in C · N reach.
+    """Load the values that decide which tiles the Gaussians with indices g in C · N reach.
 
     Returns:
         The ellipse: its centre x, y; the conic a, b, c; the level 2 ln(255 α) at which it ends; the conic's

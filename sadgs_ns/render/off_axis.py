@@ -1,7 +1,8 @@
-"""Which Gaussians lie too far off a view's axis to be drawn.
+"""Find the Gaussians that lie too far off a view's axis to be drawn.
 
 EWA splatting is linear around a Gaussian's centre. Far off the axis that is wrong: a Gaussian beside the camera, which
-is not in sight, covers the image with haze. Viewers on the web leave out what is 1.2 to 1.4 half images off its centre.
+is not in sight, covers the image with haze. Viewers on the web leave out Gaussians that are 1.2 to 1.4 half images off
+the centre.
 """
 
 from __future__ import annotations

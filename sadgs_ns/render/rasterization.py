@@ -1,4 +1,4 @@
-"""The one door to rasterization: Gaussians are projected, and composited, by one of three backends."""
+"""The one door to rasterization: one of three backends projects and composites Gaussians."""
 
 from __future__ import annotations
 

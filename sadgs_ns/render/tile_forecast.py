@@ -1,4 +1,4 @@
-"""Predicts how long the tile lists of a training step will be, so that the host need not wait for their length.
+"""Predict the length of a training step's tile lists, so that the host need not wait for it.
 
 The number of pairs of a Gaussian and a tile changes little between two visits of a view, except where densification
 lies between them. Views that were visited since then tell by how much it changed.
@@ -13,13 +13,13 @@ from typing import NamedTuple, Protocol
 MARGIN = 1.25  # Factor on the prediction, not measured: larger ones sort unused places, smaller ones repeat more steps
 RECENT = 8  # Number of the latest visits among which the largest change is taken
 MOST_PAIRS = 2**25
-"""Longer lists are not foreseen: their unused places would take 200 MB, and beside rendering a wait does not matter."""
+"""Longer lists are not predicted: unused places would take 200 MB, and rendering takes much longer than a wait."""
 _SMALL = 1000  # Pairs that are added to both numbers of a change, so a view of few Gaussians tells little about others
 _LEAST_STEP = 4096  # Smallest step between two capacities
 
 
 class Counts(Protocol):
-    """As `kernels.tiles.PairCounts`, for which Triton must be installed."""
+    """The part of `kernels.tiles.PairCounts` that is used here; importing that one needs Triton."""
 
     def ready(self) -> bool: ...
     def wait(self) -> list[int]: ...
@@ -60,7 +60,7 @@ class TileForecast:
 
         It is the sum over the views of the number at the last visit in this size, times the largest recent growth of
         any view, times MARGIN, rounded up so that few different numbers occur. None means that the host must wait: a
-        view was not visited yet, or none since a densification, or there are more than MOST_PAIRS.
+        view was never visited, no view was visited since a densification, or there are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
             self._epoch, self._num_gaussians = self._epoch + 1, num_gaussians
@@ -75,17 +75,17 @@ class TileForecast:
                 return None
             total += max([1.0, *changes]) * visit.num_pairs
         number = int(MARGIN * total) + 1
-        # So many steps of equal size divide the way from a power of two to the next.
+        # This many equal steps lead from a power of two to the next.
         step = max((1 << number.bit_length() - 1) // (2 if self.round_to_powers else 16), _LEAST_STEP)
         rounded = -(-number // step) * step
         return rounded if rounded <= MOST_PAIRS else None
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:
-        """Take the exact numbers, which may arrive later, of the call for which `capacity` was asked last."""
+        """Note the exact numbers of the call for which `capacity` was asked last; they may arrive later."""
         self._calls.append(_Call(views, size, self._epoch, capacity, counts))
 
     def overflowed(self, *, wait: bool = False) -> list[int]:
-        """Learn from the numbers that have arrived, or wait for all; return the views of calls that overflowed."""
+        """Use the numbers that have arrived, or wait for all of them; return the views of calls that overflowed."""
         lost: list[int] = []
         while self._calls and (wait or self._calls[0].counts.ready()):
             call = self._calls.popleft()

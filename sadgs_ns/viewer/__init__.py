@@ -1,1 +1,1 @@
-"""What the viewer, sadgs-inspect and the demo show of Gaussians, wavelengths and planned splits."""
+"""Pictures of Gaussians, wavelengths and planned splits for the viewer, sadgs-inspect and the demo."""

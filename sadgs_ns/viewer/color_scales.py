@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 Picture = NDArray[np.uint8]  # RGB. [H, W, 3]
 
-NOTHING = "black"  # Colour of pixels without a value, which no scale has, unlike grey, which cividis has in its middle
+NOTHING = "black"  # Colour of pixels without a value. No scale has it, while cividis has grey in its middle
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the model and the viewer's panels share: lazy outputs, a text, and which output the viewer shows."""
+"""Helpers of the model and the viewer's panels: lazy outputs, a text, and the output that the viewer shows."""
 
 from __future__ import annotations
 
