@@ -21,8 +21,7 @@ from sadgs_ns.training import checkpoints  # noqa: E402, F401
 def export_all(jobs: Sequence[Export]) -> None:
     """Export as `export` does, print the command that would, and report each file before and after it is made."""
     for job in jobs:
-        command = ["sadgs-export", str(job.run), "--output", str(job.output), "--data", str(job.data)]
-        print(f"$ {shlex.join(command)}")
+        print("$", shlex.join(["sadgs-export", str(job.run), "--output", str(job.output), "--data", str(job.data)]))
         report("export begins", output=str(job.output))
         export(job)
         report("export ends", output=str(job.output))
