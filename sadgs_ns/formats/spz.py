@@ -34,7 +34,11 @@ _STEP = 4  # Steps of the higher harmonics, in 128ths; gzip makes use of the bit
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
-    """Write at least one Gaussian as SPZ; raise InputError if positions would be coarser than 1/256 of a unit."""
+    """Write at least one Gaussian as SPZ; raise InputError if positions would be coarse, or most scales cut."""
+    median = float(np.median(gaussians.scales))
+    if not -10 < median < 5.94:
+        told = f"Most Gaussians' axes, about {math.exp(median):.1g} units, are beyond the 5e-5 to 380 that SPZ holds"
+        raise InputError(f"{told}: choose another format.")
     bits = _fractional_bits(float(np.abs(gaussians.means).max()))
     fixed = np.rint(gaussians.means * np.float64(1 << bits)).clip(1 - _RANGE, _RANGE - 1).astype("<i4")
     largest, others = smallest_three(gaussians.quats[:, [1, 2, 3, 0]])

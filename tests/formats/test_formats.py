@@ -248,6 +248,19 @@ def test_the_node_of_a_glb_turns_up_to_y(frame: Any, up: list[int], tmp_path: Pa
     np.testing.assert_allclose(turned, [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.hard_case(
+    "an SPZ in units of which a Gaussian is less than 1/22,000 or more than 380, such as kilometres",
+    "refused: choose another format; most Gaussians became as large or small as those",
+)
+@pytest.mark.parametrize("factor", [-10.0, 12.0])
+def test_an_spz_of_other_units_than_it_holds_is_refused(factor: float, tmp_path: Path):
+    written = random_gaussians(5)
+    written.scales[:] += factor
+    with pytest.raises(InputError, match=r"^Most Gaussians' axes, about \S+ units, are beyond .*: choose another"):
+        formats.write(tmp_path / "splat.spz", written)
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.hard_case("more Gaussians than glTF's 4 GB hold", "refused; nothing is written")
 def test_a_glb_of_more_than_four_gigabytes_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(glb, "_MOST_BYTES", 1000)
