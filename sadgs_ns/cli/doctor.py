@@ -139,8 +139,7 @@ def _runs(built: Sequence[str], capability: tuple[int, int]) -> bool:
 
 @dataclass
 class Doctor:
-    """Print what this machine offers to training and what a data folder holds, and check both. The exit code is 1 if
-    something would stop training."""
+    """Print and check what this machine and a data folder hold; the exit code is 1 if something would stop training."""
 
     data: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(metavar="DATA")] = None
     """Folder with transforms.json, a COLMAP model or Blender data."""

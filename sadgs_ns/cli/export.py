@@ -61,11 +61,9 @@ class Export:
     crop: Annotated[Box | None, tyro.conf.arg(metavar="X Y Z X Y Z")] = None
     """Take away Gaussians whose centre is outside the box from the lowest x, y and z to the highest."""
     dust: Annotated[float, tyro.conf.arg(metavar="PX")] = 0.0
-    """Take away Gaussians that make up less than this many pixels of each training view: opacity times area, less what
-    others hide."""
+    """Take away Gaussians that fill fewer pixels of each training view: opacity times area, less what others hide."""
     voxel_size: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
-    """Edge of a voxel of a mesh; by default two pixels at the median depth, or more where the mesh would not fit in
-    memory."""
+    """Edge of a mesh's voxels; by default two pixels at the median depth, or more if memory is short."""
 
 
 def write_gaussians(
@@ -92,8 +90,7 @@ def export(options: Export) -> int:
     """Write the Gaussians of a run of sadgs or splatfacto, or a mesh; return the number of Gaussians or triangles.
 
     A printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
-    Raise InputError if the run, the capture, an option or the output cannot be used, and WriteError if the file could
-    not be written.
+    Raise InputError if the run, the capture, an option or the output cannot be used, WriteError if writing fails.
     """
     is_page, is_mesh = format_of(options.output) == ".html", format_of(options.output) == MESH
     _check(options)

@@ -54,9 +54,8 @@ _FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
 @dataclass
 class Sadgs:
     """From photos or a video to a splat that opens in a browser: cameras (sadgs-process), training (ns-train sadgs) and
-    export (sadgs-export), each of which is a command of its own, too. Run the same command again to resume; nothing is
-    done twice. Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`; `sadgs -- --help`
-    lists them."""
+    export (sadgs-export), each of which is a command of its own, too. Run it again to resume; nothing is done twice.
+    Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`; `sadgs -- --help` lists them."""
 
     source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
     """Folder of photos or of videos, or a video."""

@@ -22,8 +22,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
     Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535: the
-    largest one tells. Points without colours are grey. Raise InputError if the file cannot be read, is cut off or holds
-    no points.
+    largest one tells. Points without colours are grey. Raise InputError if the file is broken or holds no points.
     """
     try:
         vertices = _read_vertices(path)

@@ -25,8 +25,7 @@ class Band(NamedTuple):
 def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:
     """Share the rows of one view or more, of one height in px, evenly among processes.
 
-    The bands are in the order of their processes, views and rows. They are whole views if the number of processes
-    divides that of views.
+    The bands are in the order of processes, views and rows, and whole views if their number allows it.
     """
     # The last unit of a view also has the rows that ROWS leaves over, so that SSIM's window fits each band.
     units = max(height // ROWS, 1)

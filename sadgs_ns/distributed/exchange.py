@@ -16,8 +16,7 @@ from sadgs_ns.gsplat_compat import drawn
 from sadgs_ns.render.types import Projected
 
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
-"""Widths of the columns in our compositing's rows of gradients: centre, conic, opacity, colour, the centre's absolute
-gradient, and an unused one."""
+"""Widths of our compositing's columns of gradients: centre, conic, opacity, colour, absolute centre, unused."""
 
 
 class Exchange:

@@ -1,8 +1,7 @@
 """Compressed PLY, PlayCanvas's layout: 16 bytes for each Gaussian, in chunks of 256.
 
-Between a chunk's extremes positions and scales have 11, 10 and 11 bits, and colours 8. Opacities have 8 bits, each of
-the three smallest components of quaternions 10, and the higher harmonics 8 in ±4, with errors of up to 1/64. Scales are
-cut at e^±20.
+Between a chunk's extremes positions and scales have 11, 10 and 11 bits, and colours 8. Opacities have 8 bits, the three
+smallest components of quaternions 10, the higher harmonics 8 in ±4 (errors up to 1/64). Scales are cut at e^±20.
 """
 
 from __future__ import annotations

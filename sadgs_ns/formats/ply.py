@@ -14,8 +14,7 @@ _ROWS = 1 << 16  # Gaussians that are converted at a time, so that writing takes
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write Gaussians as binary little-endian PLY.
 
-    The columns are x y z, nx ny nz (zero), f_dc_*, f_rest_* (all of red, then green, then blue), opacity, scale_* and
-    rot_* (wxyz).
+    Columns: x y z, nx ny nz (zero), f_dc_*, f_rest_* (all of red, then green, blue), opacity, scale_*, rot_* (wxyz).
     """
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
     names += [f"f_rest_{i}" for i in range(3 * gaussians.features_rest.shape[1])]

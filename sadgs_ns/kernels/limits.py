@@ -1,7 +1,6 @@
 """The largest sizes that the kernels can address, and their checks.
 
-Addresses are computed in 64 bits, except where that would cost registers or where gsplat's own kernels, which run in
-between, have 32.
+Addresses have 64 bits, except where that would cost registers or where gsplat's own kernels in between have 32.
 """
 
 from __future__ import annotations

@@ -129,8 +129,7 @@ def _list(
     A Gaussian of more than FEW pairs is left to `_list_parts`: each of its parts is noted in `parts`, as _PLACE times
     its place in the order plus the part's number, and counted in `part_count`.
 
-    The last tile gets the rest of the `num_pairs` places, or all of them if they are too few: then all radii become 0
-    and `overflowed` 1.
+    The last tile gets the rest of the `num_pairs` places. If these are too few, radii become 0 and `overflowed` 1.
     """
     lane = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = lane < n

@@ -27,8 +27,7 @@ def run_trial(device: torch.device) -> None:
 def hash_kernels() -> None:
     """Have Triton hash all kernels in one order, before the first is launched, so that another process finds them.
 
-    In Triton 3.6 the hash of a kernel, by which its cache is searched, depends on whether the functions that it calls
-    were hashed before.
+    In Triton 3.6 a kernel's hash, its key in the cache, depends on whether the functions it calls were hashed before.
     """
     for path in sorted(Path(__file__).parent.glob("[!_]*.py")):
         for value in vars(import_module(f"sadgs_ns.kernels.{path.stem}")).values():

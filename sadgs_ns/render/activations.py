@@ -15,8 +15,7 @@ def activate(
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Compute the `scales` and `opacities` of `Gaussians` from their logarithms and logits.
 
-    Also return numbers [P] whose sum is the mean opacity times `penalty` ≥ 0, or None where `penalty` is 0.
-    Differentiate their sum only.
+    Also return numbers [P] whose sum (differentiate that only) is `penalty` times the mean opacity, or None for 0.
     """
     if use_triton(logits):
         from sadgs_ns.kernels.activations import activate as fused_activate

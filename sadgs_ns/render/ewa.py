@@ -48,8 +48,7 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
 def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
     """Evaluate harmonics up to a degree ≤ 3, in 3DGS's order, without a colour's 0.5. […, 3]
 
-    `dirs` are directions from the camera, of any length […, 3], and `coeffs` at least (degree + 1)² coefficients
-    […, K, 3].
+    `dirs` are directions from the camera, of any length […, 3], and `coeffs` […, K, 3] with K ≥ (degree + 1)².
     """
     x, y, z = F.normalize(dirs, p=2, dim=-1).unbind(dim=-1)
     number = (degree + 1) ** 2

@@ -44,8 +44,7 @@ class TileForecast:
     Views are the indices of training views, and `size` the width and height in px in which they are rendered.
 
     Attributes:
-        round_to_powers: Whether capacities are rounded up to powers of two and one and a half times these, so that
-            only few different ones occur.
+        round_to_powers: Whether capacities are rounded up to 2ⁿ or 1.5 · 2ⁿ, so that few different ones occur.
     """
 
     def __init__(self) -> None:

@@ -28,8 +28,7 @@ class Interrupts:
     """A context in which the first of `SIGNALS` makes `poll` raise, and a second SIGINT or SIGTERM acts as usual.
 
     Signals that the program handles or ignores are left alone. While `waiting` returns True, nobody polls, and signals
-    raise at once. A process that `started` this one sends SIGTERM when it is interrupted itself, so then SIGTERM after
-    another signal is ignored.
+    raise at once. A process that `started` this one sends SIGTERM when it is interrupted, so then a second is ignored.
     """
 
     def __init__(self, waiting: Callable[[], bool], started: bool = False) -> None:

@@ -16,8 +16,7 @@ class NonFiniteLog:
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
         self._losses: list[Tensor] = []  # scalars on the device
-        # The first column is NaN if a gradient was left out. Triton would compile Adam anew for rows not aligned to 16
-        # bytes.
+        # The first column is NaN if a gradient was left out. Rows of 16 bytes keep Triton from compiling Adam anew.
         self._gradients = torch.zeros((capacity, 4), device=device)
         self._slots = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []

@@ -62,8 +62,7 @@ def plan_run(
     """Decide what the options of a run leave open, and print what a user should know.
 
     The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
-    is the plan of the checkpoint's run, of which `done` iterations are done. Raises InputError if `memory_budget_gb`
-    leaves no room for Gaussians.
+    is the plan of the checkpoint's run, after `done` iterations. Raises InputError if the memory holds no Gaussians.
     """
     options, model = config.pipeline, pipeline.model
     strategy, cap = options.model.strategy, options.model.strategy.max_gaussians

@@ -133,8 +133,7 @@ def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
 def local_rank_zero_first(world: World, local_rank: int) -> Iterator[None]:
     """Run the body, such as compiling, on the first process of each machine before the others; all call this.
 
-    The others then find Triton's kernels on the disk. When 24 processes compiled the same kernels at once, two ended
-    with a TypeError.
+    The others then find Triton's kernels on the disk. Of 24 processes that compiled at once, two ended by a TypeError.
     """
     if local_rank > 0:
         world.all(True)

@@ -86,8 +86,7 @@ class Stages:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
 
     def tile_lists(self) -> None:
-        # The run's image size decides between tile numbers of 16 and 32 bits; lists of a given length have one more row
-        # of tiles.
+        # The images' size decides between tile numbers of 16 and 32 bits; lists of given length have one row more.
         width, height = self.choice.size
         cameras = self.cameras._replace(width=width, height=height)
         for capacity in (None, 2**20):

@@ -69,12 +69,10 @@ def training_step(
     """Train on the views of a step; the loss is their mean. This enqueues work and changes tensors only.
 
     It waits for none of it; only several processes wait for the numbers of Gaussians that they send each other. If the
-    tile lists of a group were too short, it was not drawn and gives no gradient. If that holds for all groups, neither
-    parameters nor moments change.
+    tile lists of a group were too short, it was not drawn and gives no gradient. If all were, nothing changes.
     """
     strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
-    # Gradients of the parameters themselves would be added up on the stream of their first use, where no graph is
-    # captured.
+    # Gradients of the parameters themselves would add up on the stream of their first use, where no graph is captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
     for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
         update.parameters[name].grad = None

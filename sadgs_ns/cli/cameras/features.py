@@ -117,8 +117,7 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
     Returns:
         N keypoints, at most about `MOST_FEATURES`, none if the photo cannot be decoded: x and y in px of the file, in
         which the first pixel's centre lies at .5; scale in px; orientation in radians. float32 [N, 4]
-        Their descriptors, as COLMAP compares them: 512 times the roots of the shares of SIFT's numbers in their sum
-        (RootSIFT). uint8 [N, 128]
+        Their descriptors, as COLMAP compares them: 512 times the roots of SIFT's shares (RootSIFT). uint8 [N, 128]
     """
     image = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     points, values = (), None

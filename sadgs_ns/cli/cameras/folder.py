@@ -102,8 +102,7 @@ def images_of(cameras: Path, folder: Path) -> list[str]:
 def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
     """Return the photos of a folder for a scene, their masks by photo, and sentences on the other images that it has.
 
-    Names are relative to the folder. Photos that the scene was begun with stay photos. Hidden files and those of scenes
-    in the same folder are left out.
+    Names are relative to the folder. The scene's own photos stay photos. Hidden files and scenes' files are left out.
     """
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     files = _visible_files(folder)

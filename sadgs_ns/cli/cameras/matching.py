@@ -1,7 +1,6 @@
 """Matches of SIFT features by a matrix product of all descriptors of two photos, on a GPU.
 
-COLMAP's index on the CPU takes most of the time of matching. Its criteria decide here, too, and its geometric
-verification follows.
+COLMAP's index on the CPU takes most of the time of matching. Its criteria decide here, too, and it verifies matches.
 """
 
 from __future__ import annotations

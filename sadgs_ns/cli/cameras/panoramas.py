@@ -11,8 +11,7 @@ VIEWS = 8
 """Views of a panorama: four above the horizon, and four below it that look between those. A view of 90° × 90° has a
 quarter of the panorama's width, so nearly as many pixels as the panorama has there."""
 _PITCH = 22.5
-"""Degrees above and below the horizon. The views show all up to a latitude of 60°, and nothing over 68°, where a
-tripod or a hand is."""
+"""Degrees above and below the horizon. The views show latitudes up to 60°, and none over 68°, where a tripod is."""
 
 
 def rotations() -> np.ndarray:
