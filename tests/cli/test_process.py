@@ -44,7 +44,7 @@ from sadgs_ns.cli.cameras import features, reconstruct
 from sadgs_ns.cli.cameras.colmap import make_model, start_colmap
 from sadgs_ns.cli.cameras.command import Process, Scene, main, process
 from sadgs_ns.cli.cameras.folder import find_source, look_into
-from sadgs_ns.cli.cameras.photos import Photo, photos_by_camera, read_photos, write_masks
+from sadgs_ns.cli.cameras.photos import Photo, convert_photos, photos_by_camera, read_photos, write_masks
 from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
@@ -782,6 +782,32 @@ def test_digital_zoom_is_another_camera(tags: dict[int, Any], tmp_path: Path):
     assert photos_by_camera(read) == [["0.jpg", "1.jpg"], ["2.jpg", "3.jpg"]]
 
 
+@pytest.mark.hard_case("photos of several lenses or zooms, of one size and without EXIF", "a line says so")
+@pytest.mark.parametrize("zoomed", [0, 1, 3])
+def test_photos_of_another_zoom_than_others_of_their_camera_are_told_of(zoomed: int, tmp_path: Path):
+    centre = np.array([512, 384])
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=12, num_points3D=200)
+    options.camera_model_id = pycolmap.CameraModelId.OPENCV
+    options.camera_params = [1280, 1280, *centre, 0, 0, 0, 0]
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    for point in itertools.chain(*(image.points2D for image in images[:zoomed])):
+        point.xy = centre + 1.3 * (point.xy - centre)
+    names = [image.name for image in images]
+    told = reconstruct.summarize(names, model, tmp_path / "database.db", "exhaustive", "").zooms
+    expected = f"The focal lengths of 3 photos, such as {names[0]}, seem to differ from those of others of one size"
+    assert told.startswith(expected) if zoomed == 3 else told == ""
+
+
+@pytest.mark.hard_case("photos as TIFF in CMYK", "become RGB, which training reads")
+def test_photos_in_cmyk_become_rgb(tmp_path: Path):
+    next(draw_photos()).convert("CMYK").save(tmp_path / "a.tif")
+    folder, _ = convert_photos(tmp_path, read_photos(tmp_path, ["a.tif"], lambda *step: None), tmp_path / "converted")
+    with Image.open(folder / "a.tif") as image:
+        assert image.mode == "RGB"
+
+
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     """The folder of its database does not exist."""
@@ -1025,6 +1051,26 @@ def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner:
     quarters = [redness[: height // 2], redness[height // 2 :]]
     red = [[half[:, : width // 2].mean(), half[:, width // 2 :].mean()] for half in quarters]
     assert np.unravel_index(np.argmax(red), (2, 2)) == corner
+
+
+@pytest.mark.hard_case("HDR videos (HLG, PQ), as phones record them", "frames have the colours of sRGB, not pale ones")
+@pytest.mark.parametrize(("transfer", "white"), [(18, 0.75), (16, 0.58)])  # HLG and PQ, and their signal for white
+def test_frames_of_a_film_in_hdr_are_not_pale(transfer: int, white: float, tmp_path: Path):
+    pixels = np.zeros((32, 48), np.uint16)
+    pixels[:, 24:] = round(white * 65535)
+    with av.open(str(tmp_path / "film.mp4"), "w") as container:
+        stream: Any = container.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p10le"
+        context = stream.codec_context
+        context.color_primaries = context.colorspace = 9  # BT.2020
+        context.color_trc, context.color_range = transfer, 1
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="gray16le")))
+        container.mux(stream.encode())
+    frames = [frame for _, frame in video_frames(tmp_path / "film.mp4", [], 3)]
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.shape == (32, 48, 3) and frame[:, :20].max() < 12 and frame[:, 28:].min() > 240
 
 
 @pytest.mark.hard_case(

@@ -121,7 +121,8 @@ def _read_photo(folder: Path, name: str) -> Photo:
         lens = exif.get_ifd(ExifTags.IFD.Exif)
         focals = [str(lens.get(tag) or None) for tag in _FOCAL_LENGTHS]  # as text: 0/0 is not equal to itself
         camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
-        has_alpha, is_read = image.has_transparency_data, image.format in COLMAP_FORMATS
+        has_alpha = image.has_transparency_data
+        is_read = image.format in COLMAP_FORMATS and image.mode not in ("CMYK", "LAB")  # A TIFF would stay CMYK.
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         least = 512 if width == 2 * height else 0
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))

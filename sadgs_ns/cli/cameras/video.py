@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
+
+_HDR = (16, 18)  # FFmpeg's numbers of PQ and HLG, in which phones record unless they are told otherwise
 
 
 def count_frames(video: Path) -> int:
@@ -28,32 +32,38 @@ def count_frames(video: Path) -> int:
         raise InputError(f"{video} cannot be read as a video ({why}); {remedy}") from error
 
 
-def read_frames(video: Path) -> Iterator[np.ndarray]:
-    """Yield the frames of a video as a player shows them: upright, and without damaged ones. BGR, uint8 [H, W, 3]"""
-    import av
+def read_frames(stream: Any) -> Iterator[Any]:
+    """Yield the frames of PyAV's stream of a video, without damaged ones."""
     from av.error import InvalidDataError
 
-    with av.open(os.fspath(video)) as container:
-        stream = container.streams.best("video")
-        assert isinstance(stream, av.VideoStream)  # `count_frames` was called before.
-        stream.codec_context.thread_type = "AUTO"
-        for packet in container.demux(stream):
-            try:
-                frames = stream.decode(packet)
-            except InvalidDataError:
-                continue
-            for frame in frames:
-                yield np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90)
+    stream.codec_context.thread_type = "AUTO"
+    for packet in stream.container.demux(stream):
+        with contextlib.suppress(InvalidDataError):
+            yield from stream.decode(packet)
 
 
 def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the number of each of `count` stretches of a video, and its frame, BGR, whose Laplacian varies most."""
+    """Yield numbers of `count` stretches of a video, and their sharpest frames, upright and in sRGB. BGR [H, W, 3]"""
+    import av
     import cv2
+    from av.filter import Graph
 
-    stretches = itertools.groupby(enumerate(read_frames(video)), lambda numbered: numbered[0] * count // total)
-    for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
-        grey = ((frame, cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)) for _, frame in group)
-        yield number, max(grey, key=lambda both: cv2.Laplacian(both[1], cv2.CV_64F).var())[0]
+    with av.open(os.fspath(video)) as container:
+        stream, to_sdr = container.streams.best("video"), Graph()
+        assert isinstance(stream, av.VideoStream)  # `count_frames` was called before.
+        if is_hdr := stream.codec_context.color_trc in _HDR:
+            scale = to_sdr.add("scale", "out_transfer=iec61966-2-1:out_primaries=bt709")
+            nodes = to_sdr.add_buffer(stream), scale, to_sdr.add("format", "bgr24"), to_sdr.add("buffersink")
+            to_sdr.link_nodes(*nodes).configure()
+        stretches = itertools.groupby(enumerate(read_frames(stream)), lambda numbered: numbered[0] * count // total)
+        for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
+            grey = ((frame, frame.to_ndarray(format="gray")) for _, frame in group)
+            frame = max(grey, key=lambda both: cv2.Laplacian(both[1], cv2.CV_64F).var())[0]
+            turns = frame.rotation // 90
+            if is_hdr:  # Only of the chosen ones, as each takes .3 s.
+                to_sdr.vpush(frame)
+                frame = to_sdr.vpull()
+            yield number, np.rot90(frame.to_ndarray(format="bgr24"), turns)
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
