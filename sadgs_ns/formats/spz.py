@@ -3,8 +3,7 @@
 Positions have 24 bits, as many of them behind the point as the furthest Gaussian leaves. Logarithms of scales are cut
 to −10 … 5.94 and have steps of 1/16, opacities have 8 bits, colours steps of 1/38 in the harmonic of degree 0, cut at
 ±3.33, and quaternions 9 bits and a sign for each of the three smallest components. The higher harmonics are cut at ±1
-and have steps of 1/32; with those of Niantic's own writer, 1/16 in degree 1 and 1/8 above, most of what a short run
-learns there would be zero.
+and have steps of 1/32; Niantic's own, 1/16 in degree 1 and 1/8 above, would make most of a short run's zero.
 
 Axes are those of the PLY, as a record of Adobe's at the end says. Without it some readers, such as Niantic's library,
 take a file's axes for OpenGL's, half a turn around x away.

@@ -1,7 +1,6 @@
 """The three operations of `method.structure_tensor`.
 
-With such long convolution kernels cuDNN takes several times as long, and torch needs forty launches for the rest of a
-level.
+With such long convolution kernels cuDNN takes several times as long, and torch needs forty launches more for a level.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Runs COLMAP in a process of its own.
 
 COLMAP aborts the whole process at an error in one of its threads, such as a full disk or a failed download, and ignores
-signals while it works. pycolmap's library also replaces Pillow's zlib: Pillow, if it is loaded later, crashes when it
-writes a PNG.
+signals while it works. pycolmap also replaces Pillow's zlib: Pillow crashes writing a PNG if it is loaded later.
 """
 
 from __future__ import annotations
