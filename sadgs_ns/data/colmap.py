@@ -7,10 +7,10 @@ take a tenth of the time of nerfstudio's, and less than it takes to import pycol
 from __future__ import annotations
 
 import contextlib
-import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
 
@@ -46,9 +46,7 @@ class _Binary:
     def __init__(self, path: Path) -> None:
         self.path, self.offset = path, 0
         with path.open("rb") as file:
-            self.content: mmap.mmap | bytes = (
-                mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
-            )
+            self.content: mmap | bytes = mmap(file.fileno(), 0, access=ACCESS_READ) if path.stat().st_size else b""
 
     def corrupt(self, detail: str) -> InputError:
         """Return the error for content that makes no sense."""
@@ -117,8 +115,9 @@ def _read_binary_points(path: Path) -> Points:
     return points["position"], points["color"].copy()
 
 
-def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[str]]]:
-    """Yield the fields of each line that is neither empty nor a comment, and the lines after it."""
+def _read_text(path: Path, minimum: int, numbered: bool = True) -> Iterator[tuple[list[str], Iterator[str]]]:
+    """Yield the fields of each line of data, and the lines after it; if they are numbered, no two have one number."""
+    numbers = set[str]()
     with path.open(encoding="utf8") as file:
         check_byte_order_mark(file.read(1), path)
         file.seek(0)
@@ -127,6 +126,9 @@ def _read_text(path: Path, minimum: int) -> Iterator[tuple[list[str], Iterator[s
                 fields = line.split()
                 if len(fields) < minimum:
                     raise ValueError(f"{minimum} fields expected in {line.strip()[:60]!r}")
+                if fields[0] in numbers:
+                    raise ValueError(f"two lines have the number {fields[0]}")
+                numbers.add(fields[0] if numbered else "")
                 yield fields, file
 
 
@@ -143,15 +145,14 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
                 "end: write the model in binary (`colmap model_converter --output_type BIN`), or rename the image."
             )
         keypoints = next(following, "").split()
-        pose = fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
         if len(keypoints) % 3:  # Each has x, y and the number of its point.
             problem = f"{path}: the line after image {fields[9]!r} does not hold its keypoints"
             raise InputError(f"{problem}: each image needs such a line, which may be empty.")
-        yield pose
+        yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
 
 
 def _read_text_points(path: Path) -> Points:
-    lines = [fields[1:7] for fields, _ in _read_text(path, 8)]
+    lines = [fields[1:7] for fields, _ in _read_text(path, 8, numbered=False)]
     positions, colors = np.hsplit(np.array(lines, np.float64).reshape(-1, 6), 2)
     if not ((colors >= 0) & (colors <= 255)).all():
         raise ValueError("a colour is not in 0 … 255")

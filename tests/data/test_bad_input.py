@@ -461,6 +461,13 @@ COLMAP = {
         ),
         r"\S+/images\.txt: image 'a b\.png' has a space in its name, where nerfstudio takes the name to end: .*\.",
     ),
+    "text-twice": (
+        lambda data: (
+            model(lambda *parts: None, ".txt")(data),
+            overwrite(f"{SPARSE}/images.txt", "1 1 0 0 0 0 0 0 1 000.png\n\n1 1 0 0 0 0 0 1 1 001.png\n\n")(data),
+        ),
+        r"\S+/images\.txt is not COLMAP's text \(two lines have the number 1\): copy it again, or run .*",
+    ),
     "text-corrupt": (
         lambda data: (
             model(lambda *parts: None, ".txt")(data),
@@ -821,6 +828,11 @@ CASES = {
     "points-truncated",
 )
 @pytest.mark.hard_case("corrupt COLMAP text", "refused", "text-corrupt", "text-colour")
+@pytest.mark.hard_case(
+    "COLMAP's text with two images or cameras of one number, of which nerfstudio reads the last",
+    "refused",
+    "text-twice",
+)
 @pytest.mark.hard_case(
     "`transforms.json` cut off or of another kind; one of Blender's missing",
     "refused",
