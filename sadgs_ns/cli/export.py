@@ -50,8 +50,7 @@ class Export:
     """Folder of a run, its config.yml, or one of its checkpoints."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help=_OUTPUT)]
     frame: Frame = "nerfstudio"
-    """Coordinates: nerfstudio's, centred, upright and with cameras within ±1, or those of the COLMAP model or
-    transforms.json that the data came with."""
+    """Coordinates: nerfstudio's, upright with cameras within ±1, or those of the COLMAP model or transforms.json."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
     """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
     min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0

@@ -32,8 +32,7 @@ from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_p
 Split = Literal["train", "eval"]
 SEED = 0  # Seed of the random colours and of AbsGS's children
 MIN_SIDE, MIN_RENDER_SIDE = 900, 640
-"""Least length in px of the longer side of a picture with ellipses, and of a rendering in random colours; Gaussians in
-a smaller one could not be told apart."""
+"""Least longer side in px of a picture with ellipses and of one in random colours; smaller ones show no Gaussians."""
 _REMEDY = "give another with --load-step, or another run of sadgs"
 
 
@@ -51,8 +50,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does; options as `Inspect`'s.
 
     The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it. Return
-    the pipeline in evaluation mode, and the iterations that it was trained; raise InputError if there is no such file
-    or checkpoint, or they are of another method.
+    the pipeline in evaluation mode, and its iterations; raise InputError if a file lacks, or is of another method.
     """
     if path.is_dir():
         path = path / "config.yml"

@@ -32,8 +32,7 @@ def write_mesh(
 ) -> int:  # fmt: skip
     """Fuse what the training views see into a mesh, write it as `atomic_path` does, and return its number of triangles.
 
-    Raise InputError if no view shows a surface, voxels do not fit in memory, or open3d cannot be imported, and
-    WriteError if the file could not be written.
+    Raise InputError if no view shows a surface, memory is short or open3d is missing, and WriteError if writing fails.
 
     Args:
         params: As `of_parameters` takes them.

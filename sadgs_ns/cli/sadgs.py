@@ -192,8 +192,7 @@ class PhotosToSplat:
     def _keep_frame_and_split(self, before: Sequence[str]) -> None:
         """Write into the scene how the present run moved its images, `before`, and which of them it held out.
 
-        The added photos are divided as nerfstudio would divide them. An option on held-out views takes precedence.
-        Without a run there is nothing to keep.
+        The added photos are divided as nerfstudio would, unless an option divides them. Without a run nothing is kept.
         """
         from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 

@@ -96,8 +96,7 @@ def _page() -> bytes:
 def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, means: NDArray[np.float32]) -> Start:
     """Return the start at a camera, with a target as deep as the middle of its view.
 
-    The pose [3, 4] has OpenGL axes and the frame of the Gaussians' positions [N, 3]. `side` is the longer side of the
-    image, and `focal` the focal length, in px.
+    The pose [3, 4] has OpenGL axes and the frame of the positions [N, 3]; `side`, the longer one, and `focal` are px.
     """
     position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
     depths = (means - position) @ forward

@@ -51,8 +51,7 @@ class RenderOptions:
     near_plane: float = NEAR_PLANE
     """Gaussians whose centre is nearer along the viewing axis are not drawn, in world units."""
     max_off_axis: float = 0.0
-    """Gaussians whose centre is projected further from the image's centre, in half images along x or y, are not drawn
-    (off_axis.py); 0 draws all."""
+    """Gaussians centred more half images from the image's centre in x or y are not drawn (off_axis.py); 0 draws all."""
     expected_depth: bool = False
     """Whether the expected depth is rendered as one more channel."""
     absgrad: bool = False

@@ -138,7 +138,7 @@ def _undistort_as(camera: Cameras) -> _Undistort:
 class ImagePrefetcher:
     """Copies images from the host to the device ahead of the step that needs them, on its own stream.
 
-    Threads decode `LazyImages` and copy them to pinned memory, unless they are `decoded`. Without CUDA, they decode.
+    Threads decode `LazyImages` and pin them; those that are `decoded` need none. Without CUDA only decoding runs ahead.
     """
 
     def __init__(self, images: Sequence[Mapping[str, Any]], device: torch.device, threads: int) -> None:

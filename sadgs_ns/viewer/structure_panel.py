@@ -194,8 +194,7 @@ class StructurePanel(torch.nn.Module):
     def choose(self) -> None:
         """Compute what the present choice needs, and have the viewer show it.
 
-        `picture` does not do so, because the viewer aborts drawing at any line when its camera moves, and photos that
-        are undistorted twice would be wrong.
+        `picture` does not, because the viewer aborts drawing at any line, and photos undistorted twice would be wrong.
         """
         chosen = self.choice.value
         if chosen in OF_STATISTICS and self.statistics() is None:

@@ -185,8 +185,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
-    new photos, and photos that did not register before are tried again. Raise InputError if no two photos could be
-    related, or no photo could be added.
+    new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
     """
     before = None if base is None else pycolmap.Reconstruction(base)
     with pycolmap.Database.open(database) as opened:
@@ -275,8 +274,7 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
     """Write `images`, `alpha`, `masks` and their model, `sparse/0`, to the folder `undistorted`, which is made anew.
 
-    `made` is what the folder `model` holds, and photos that are `known` were undistorted before, by the same cameras.
-    Raise OSError if the model could not be written.
+    `made` is what `model` holds; `known` photos were undistorted before. Raise OSError if the model cannot be written.
     """
     folder = model.with_name("undistorted")
     registered = [image for image in made.images.values() if image.has_pose and image.name not in known]

@@ -24,8 +24,7 @@ def check_splits(
 ) -> Generator[Finding, None, int]:  # fmt: skip
     """Check how the images with poses are divided, and return how many are trained on.
 
-    Raise InputError if "train" or "val" lacks a list beside others, a list names an unknown image, or a name that shall
-    divide the images does not say where it belongs.
+    Raise InputError if "train" or "val" lacks a list beside others, a list names an unknown image or a name has none.
 
     Args:
         names: The names of all images that have poses.

@@ -111,8 +111,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
 def read_transforms(path: Path) -> dict[str, Any]:
     """Return a `transforms.json` for nerfstudio's parser, in which each frame has all values that it shares.
 
-    A frame's own values precede those of the file. Raise InputError as `read_json` and `frames_of`, for a wrong angle
-    of view, and for mixed models of cameras.
+    A frame's own values come first. Raise InputError as `read_json` and `frames_of`, for wrong angles or mixed models.
     """
     meta, models = read_json(path), set()
     frames = [frame | _completed(frame, meta, path) for frame in frames_of(meta, path)]
