@@ -1053,6 +1053,22 @@ def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner:
     assert np.unravel_index(np.argmax(red), (2, 2)) == corner
 
 
+@pytest.mark.hard_case("interlaced videos, as camcorders record them", "frames have no edges like combs")
+def test_frames_of_an_interlaced_film_are_no_combs(tmp_path: Path):
+    with av.open(str(tmp_path / "film.mts"), "w", format="mpegts") as container:
+        stream: Any = container.add_stream("libx264", rate=25, options={"x264opts": "interlaced=1:tff=1"})
+        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        for i in range(8):
+            pixels = np.full((64, 128, 3), 40, np.uint8)
+            pixels[::2, 10 * i : 10 * i + 40] = pixels[1::2, 10 * i + 5 : 10 * i + 45] = 220  # half a frame later
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+        container.mux(stream.encode())
+    frames = [frame[:, :, 1].astype(int) for _, frame in video_frames(tmp_path / "film.mts", [], 4)]
+    assert len(frames) == 4
+    for frame in frames[1:-1]:  # The filter looks at both neighbours.
+        assert np.abs(frame[1:-1] - (frame[:-2] + frame[2:]) / 2).mean() < 3
+
+
 @pytest.mark.hard_case("HDR videos (HLG, PQ), as phones record them", "frames have the colours of sRGB, not pale ones")
 @pytest.mark.parametrize(("transfer", "white"), [(18, 0.75), (16, 0.58)])  # HLG and PQ, and their signal for white
 def test_frames_of_a_film_in_hdr_are_not_pale(transfer: int, white: float, tmp_path: Path):

@@ -176,7 +176,7 @@ def _make(scene: Scene, report: Report) -> Summary:
         folder, names = options.source, scene.settings["photos"]
         if scene.is_video:
             if names:
-                _say("videos", f"Frames of {len(names)} videos are taken, each with a camera of its own.")
+                _say("aside", f"Frames of {len(names)} videos are taken, each with a camera of its own.")
             folder = work / "frames"
             chosen = [] if folder.exists() else video_frames(options.source, names, options.frames)
             scene.settings["files"] = scene.begun.get("files") or photo_stamps(options.source, names or [""])
@@ -272,8 +272,7 @@ def _reporter(progress: Progress) -> Report:
 def _publish(undistorted: Path, out: Path, grown: bool) -> None:
     """Move undistorted photos, their model and what nerfstudio reads of it to the scene's folder.
 
-    A finished scene that has `grown` by these photos stays one until all are there. Raise an OSError if a file cannot
-    be written, or COLMAP could not write one.
+    A finished scene that has `grown` by these photos stays one until all are there. Raise OSError if writing fails.
     """
     images, described = undistorted / "images", json.loads((undistorted / "transforms.json").read_text())
     written = [frame["file_path"] for frame in described["frames"]]

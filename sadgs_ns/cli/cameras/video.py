@@ -42,28 +42,43 @@ def read_frames(stream: Any) -> Iterator[Any]:
             yield from stream.decode(packet)
 
 
+def filtered(frames: Iterable[Any], stream: Any, *filters: tuple[str, str]) -> Iterator[Any]:
+    """Yield a stream's frames as FFmpeg's filters, name and options each, return them."""
+    from av.filter import Graph
+
+    graph = Graph()
+    nodes = graph.add_buffer(stream), *(graph.add(*one) for one in filters), graph.add("buffersink")
+    graph.link_nodes(*nodes).configure()
+    for frame in itertools.chain(frames, [None]):
+        graph.vpush(frame)
+        with contextlib.suppress(BlockingIOError, EOFError):
+            while True:
+                yield graph.vpull()
+
+
 def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, np.ndarray]]:
     """Yield numbers of `count` stretches of a video, and their sharpest frames, upright and in sRGB. BGR [H, W, 3]"""
     import av
     import cv2
-    from av.filter import Graph
+
+    def sharpness(frame: Any) -> float:
+        return cv2.Laplacian(frame.to_ndarray(format="gray"), cv2.CV_64F).var()
 
     with av.open(os.fspath(video)) as container:
-        stream, to_sdr = container.streams.best("video"), Graph()
+        stream = container.streams.best("video")
         assert isinstance(stream, av.VideoStream)  # `count_frames` was called before.
-        if is_hdr := stream.codec_context.color_trc in _HDR:
-            scale = to_sdr.add("scale", "out_transfer=iec61966-2-1:out_primaries=bt709")
-            nodes = to_sdr.add_buffer(stream), scale, to_sdr.add("format", "bgr24"), to_sdr.add("buffersink")
-            to_sdr.link_nodes(*nodes).configure()
-        stretches = itertools.groupby(enumerate(read_frames(stream)), lambda numbered: numbered[0] * count // total)
-        for number, group in itertools.takewhile(lambda stretch: stretch[0] < count, stretches):
-            grey = ((frame, frame.to_ndarray(format="gray")) for _, frame in group)
-            frame = max(grey, key=lambda both: cv2.Laplacian(both[1], cv2.CV_64F).var())[0]
-            turns = frame.rotation // 90
-            if is_hdr:  # Only of the chosen ones, as each takes .3 s.
-                to_sdr.vpush(frame)
-                frame = to_sdr.vpull()
-            yield number, np.rot90(frame.to_ndarray(format="bgr24"), turns)
+        frames = read_frames(stream)
+        first = list(itertools.islice(frames, 1))
+        frames = itertools.chain(first, frames)
+        if any(frame.interlaced_frame for frame in first):  # Comb-like edges would count as sharp.
+            frames = filtered(frames, stream, ("bwdif", "deint=interlaced"))
+        stretches = itertools.groupby(enumerate(frames), lambda numbered: numbered[0] * count // total)
+        chosen = (max((frame for _, frame in stretch), key=sharpness) for i, stretch in stretches if i < count)
+        if stream.codec_context.color_trc in _HDR:
+            to_sdr = "out_transfer=iec61966-2-1:out_primaries=bt709"
+            chosen = filtered(chosen, stream, ("scale", to_sdr), ("format", "bgr24"))
+        for number, frame in enumerate(chosen):
+            yield number, np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90)
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
