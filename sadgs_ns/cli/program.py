@@ -39,8 +39,7 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
 def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     """Run a command that can be resumed, print the sentence of an error, and return the exit code.
 
-    It is the result of `run`, 1 if a file in `folder` could not be written or the run failed, 2 if the input is wrong,
-    and 130, 143 or 129 after SIGINT, SIGTERM or SIGHUP.
+    It is `run`'s; 1 if it failed or could not write; 2 for wrong input; 130, 143 or 129 for SIGINT, SIGTERM or SIGHUP.
     """
     try:
         return run()
