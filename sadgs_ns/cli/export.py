@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -18,7 +18,7 @@ from sadgs_ns.cli.program import parse
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH, format_of, html
-from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, Frame, of_parameters
+from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, of_parameters
 from sadgs_ns.formats.mesh import load_open3d
 
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
@@ -49,7 +49,7 @@ class Export:
     run: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
     """Folder of a run, its config.yml, or one of its checkpoints."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help=_OUTPUT)]
-    frame: Frame = "nerfstudio"
+    frame: Literal["nerfstudio", "colmap"] = "nerfstudio"
     """Coordinates: nerfstudio's, upright with cameras within ±1, or those of the COLMAP model or transforms.json."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
     """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
@@ -117,7 +117,9 @@ def export(options: Export) -> int:
     if is_page and cameras is not None:
         pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
-    return write_gaussians(options.output, params, Context(options.frame, start), similarity)
+    up = np.eye(3)[2] if similarity is None else similarity.orthogonal[:, 2]
+    x, y, z = (np.eye(3)[np.abs(up).argmax()] * np.sign(up)).tolist()  # The nearest axis of the file's frame
+    return write_gaussians(options.output, params, Context((x, y, z), start), similarity)
 
 
 def _check(options: Export) -> None:
@@ -227,6 +229,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
     what = "triangles fused from rendered depth" if format_of(options.output) == MESH else "Gaussians"
-    size = options.output.stat().st_size / 1e6
-    print(f"{options.output}: {count:,} {what}, {size:,.1f} MB, in the frame of {options.frame}")
+    told = f"{count:,} {what}, {options.output.stat().st_size / 1e6:,.1f} MB, in the frame of {options.frame}"
+    print(f"{options.output}: {told}")
     return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ DEGREE_0 = 0.5 / np.sqrt(np.pi)  # The spherical harmonic of degree 0
 _ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that float64 takes little memory
 
 Array = NDArray[np.float32]
-Frame = Literal["nerfstudio", "colmap"]  # nerfstudio's coordinates, where z is up, or COLMAP's, where y mostly is down
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,7 @@ class Start:
 class Context:
     """What a writer may need beside the Gaussians."""
 
-    frame: Frame = "nerfstudio"  # That of the Gaussians
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Axis of the Gaussians' frame that is up
     start: Start | None = None  # There if the file is a page
 
 

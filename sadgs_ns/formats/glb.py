@@ -18,8 +18,6 @@ _FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
 """glTF's numbers for types of values, the purpose of a buffer, and the kind of primitives."""
 _MOST_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_TO_Y_UP = {"nerfstudio": (-(0.5**0.5), 0.0, 0.0, 0.5**0.5), "colmap": (1.0, 0.0, 0.0, 0.0)}
-"""Rotations, xyzw, of the frames to one in which y is up."""
 
 
 def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
@@ -27,6 +25,8 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
 
     Viewers that do not know the extension show coloured points. The node turns y up, as in glTF.
     """
+    x, y, z = context.up
+    turn = np.array([-z, 0.0, x, 1 + y] if y > -1 else [1.0, 0.0, 0.0, 0.0])  # This quaternion, xyzw, turns up to y.
     attributes = _attributes(gaussians)
     arrays = list(attributes.values())
     sizes = [array.nbytes for array in arrays]
@@ -47,7 +47,7 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _TO_Y_UP[context.frame]}],
+        "nodes": [{"mesh": 0, "rotation": (turn / np.linalg.norm(turn)).tolist()}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [

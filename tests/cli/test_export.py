@@ -23,6 +23,7 @@ from kill_and_resume import configure, parser_of, set_up
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from plyfile import PlyData
 from runs import nerfstudio_data
+from scipy.spatial.transform import Rotation
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.cli import export
@@ -232,6 +233,30 @@ def test_nerfstudio_s_frame_keeps_the_parameters_and_colmap_s_returns_to_the_poi
     reconstruction = pycolmap.Reconstruction(scene / SPARSE_FOLDER)
     expected = np.array([point.xyz for _, point in sorted(reconstruction.points3D.items())])
     np.testing.assert_allclose(np.sort(back, 0), np.sort(expected, 0), atol=1e-5)
+
+
+@pytest.mark.hard_case(
+    "a GLB in the frame of data in which y is up, such as ARKit's, or z", "upright; it was upside down, or lay there"
+)
+@pytest.mark.parametrize(
+    ("rows", "node"),
+    {
+        "x right, y up": ([0, 2, 1], [0, 0, 0, 1]),
+        "z up": ([0, 1, 2], [-(0.5**0.5), 0, 0, 0.5**0.5]),
+        "y down": ([0, 2, -1], [1, 0, 0, 0]),
+    }.values(),
+)
+def test_a_glb_in_the_data_s_frame_is_upright(rows: list[int], node: list[float], tmp_path: Path):
+    transform = np.zeros((3, 4))
+    for row, column in enumerate(rows):  # Rows of the map from the data to z up; a negative one is −y.
+        transform[row, abs(column)] = -1 if column < 0 else 1
+    transform[1] *= np.linalg.det(transform[:, :3])
+    tilt = Rotation.from_rotvec([0.2, -0.1, 0.0]).as_matrix()
+    run = write_run(tmp_path / "run", gaussians(3), tilt @ transform, 2.0)
+    export.export(Export(run, tmp_path / "splat.glb", "colmap"))
+    data = (tmp_path / "splat.glb").read_bytes()
+    (found,) = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])["nodes"]
+    np.testing.assert_allclose(found["rotation"], node, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [1, 70_000])
