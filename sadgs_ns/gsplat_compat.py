@@ -1,8 +1,7 @@
 """Where gsplat 1.4.0 and 1.5.3 differ, so that a new gsplat changes this file; all that is used of it is public.
 
 Their sources were read, and nothing is claimed of gsplat 1.6, which is not released. tests/test_gsplat_compat.py fails
-where a gsplat has other signatures or shapes. Importing this module loads none of gsplat's CUDA kernels: gsplat loads
-or compiles them when the first of them runs.
+where a gsplat has other signatures or shapes. Importing this loads no CUDA kernels: gsplat does when the first runs.
 """
 
 from __future__ import annotations

@@ -24,8 +24,7 @@ MANY_IMAGES = 500  # Up to this many training images nerfstudio would keep on th
 IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
 """Largest shares of the device's free memory for the images if there are more than `MANY_IMAGES`, and if not."""
 HOST_SHARE = 0.5
-"""Largest share of the host's available memory for decoded images. torch may take twice as much for pinned memory,
-since it rounds up to powers of two."""
+"""Largest share of the host's free memory for decoded images, of which torch rounds pinned ones up to powers of two."""
 
 
 @dataclass(frozen=True)

@@ -645,6 +645,25 @@ def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp
     assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
 
 
+@pytest.mark.hard_case("masks of two colours, such as black and red, or of 0 and 128", "the brighter one is white")
+@pytest.mark.parametrize("bright", [(255, 255, 255), (128, 128, 128), (200, 0, 0), (1, 1, 1)])
+def test_the_brighter_colour_of_a_mask_is_white(bright: tuple[int, int, int], tmp_path: Path):
+    photos = {f"{i}.png": photo for i, photo in enumerate(itertools.islice(draw_photos(), 3))}
+    (tmp_path / "masks").mkdir()
+    for i, (name, photo) in enumerate(photos.items()):
+        photo.save(tmp_path / name)
+        mask = Image.new("RGB", photo.size, bright)
+        mask.paste((0, 0, 0), (0, 0, 40 + i, HEIGHT))
+        mask.save(tmp_path / "masks" / name)
+    found, masks, told = look_into(tmp_path, tmp_path / "out")
+    assert found == [*photos] and masks == {name: f"masks/{name}" for name in photos} and not told
+    read = read_photos(tmp_path, found, lambda *step: None)
+    write_masks(tmp_path, masks, read, read, tmp_path / "written")
+    for i, name in enumerate(photos):
+        white = np.asarray(Image.open(tmp_path / "written" / f"{name}.png"))
+        assert not white[:, : 40 + i].any() and (white[:, 40 + i :] == 255).all()
+
+
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")
 def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
     for name, height in (("pano.png", 0), ("mask.png", 64)):

@@ -164,7 +164,8 @@ def process(options: Process) -> Summary:
     for sentence in filter(None, [summary.zooms, *scene.left_out]):
         _say("aside", sentence)
     if not scene.is_video and (videos := find_videos(options.source)):
-        print(f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own.")
+        told = f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own."
+        _say("aside", told)
     return summary
 
 

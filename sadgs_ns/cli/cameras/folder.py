@@ -156,13 +156,14 @@ def _stem(name: str) -> str:
 
 
 def _is_mask(path: Path) -> bool:
-    """Return whether nearly all of an image is black or white."""
+    """Return whether an image has two colours at most, or nearly all of it is black or white."""
     try:
         with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST))
+            pixels = np.reshape(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST), (-1, 3))
     except Exception:  # A damaged image is named when it is read.
         return False
-    return bool(((pixels < 16).all(-1) | (pixels > 239).all(-1)).mean() > 0.95)
+    is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
+    return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
 
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:

@@ -208,7 +208,7 @@ def write_masks(
         if photo.name in masks:
             with Image.open(folder / masks[photo.name]) as image, Image.open(folder / photo.name) as stored:
                 grey = np.asarray(image.convert("L"))
-                mask = Image.fromarray(np.uint8(255 * (grey > (127 if grey.max() > 15 else 0))))
+                mask = Image.fromarray(np.uint8(255 * (grey > grey.max() // 2)))
                 if photo.is_turned and (mask.width > mask.height) != (photo.size[0] > photo.size[1]):
                     mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
                     mask = ImageOps.exif_transpose(mask)
