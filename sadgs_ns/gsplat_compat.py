@@ -52,8 +52,7 @@ def project(
 def try_kernels() -> None:
     """Run one of gsplat's CUDA kernels, for which gsplat loads or compiles them all.
 
-    Raise RuntimeError if they neither came with the wheel nor can be compiled for lack of a toolkit, or were compiled
-    for another GPU, and whatever compiling them raises.
+    Raise RuntimeError if they are for another GPU or there is no toolkit to compile them, and what compiling raises.
     """
     direction = torch.ones((1, 3), device="cuda")
     try:

@@ -108,8 +108,7 @@ class World:
     def rand(self, like: Tensor) -> Tensor:
         """Draw this process's part of random numbers in [0, 1) for all Gaussians, of the tensor's shape. [V, N, 2]
 
-        All processes draw all numbers, so that random generators in the same state stay so. On the CPU the numbers are
-        those of `torch.rand((V, total, 2))`.
+        All processes draw all numbers, so that their generators stay alike; on the CPU as `torch.rand((V, total, 2))`.
         """
         if self.alone:
             return torch.rand(like.shape, device=like.device)

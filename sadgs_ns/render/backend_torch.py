@@ -1,7 +1,6 @@
 """Gaussian splatting in plain torch, as gsplat draws, in float32 or float64, on any device.
 
-Compositing handles bounded chunks of (pixel, Gaussian) pairs and evaluates them again in the backward pass, so that the
-peak memory does not grow with the number of pairs.
+Compositing takes chunks of (pixel, Gaussian) pairs, again in the backward pass, so the memory has a bound.
 """
 
 from __future__ import annotations

@@ -35,8 +35,7 @@ def project(
             that the host waits for their length while the device computes colours.
 
     Raises:
-        InputError: If `options.backend` cannot draw on this device, or there are more Gaussians or pixels than the
-            Triton kernels can address (kernels/limits.py).
+        InputError: If `options.backend` cannot draw on this device, or so many Gaussians or pixels (kernels/limits.py).
     """
     return _backend(options.backend, gaussians.means.device).project(gaussians, cameras, options, begin_tiles)
 

@@ -2,8 +2,7 @@
 
 On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the
 arguments with which they were captured. So cameras, images and Adam's rates are copied, before each step, into tensors
-that keep their addresses. Everything else that a step depends on is part of its graph's key. When densification
-replaces parameters, all graphs are dropped.
+that keep their addresses. All else that a step depends on is part of its graph's key. Densification drops all graphs.
 """
 
 from __future__ import annotations
@@ -52,8 +51,7 @@ class CudaGraphs:
         """Capture what a function launches, without running it, and return one that replays it.
 
         The results of all replays are the same tensors. The function may launch only kernels that were launched before,
-        since none may be compiled or loaded meanwhile. Raises as the function, or RuntimeError. torch's context manager
-        would wait for the device at each capture.
+        since none may be compiled meanwhile. Raises as the function, or RuntimeError. torch's context manager would wait.
         """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream):

@@ -46,8 +46,7 @@ def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: 
 class LazyImages(Sequence[dict[str, Any]]):
     """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
 
-    Several threads may access images at once. The dataset belongs to this object: its cameras become those of the
-    undistorted images at once, without opening any.
+    Several threads may access images. The dataset's cameras become those of the undistorted images, none opened.
     """
 
     def __init__(self, dataset: InputDataset) -> None:

@@ -100,8 +100,7 @@ def fit_to_memory(
     """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
     A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
-    `max_gaussians` is lowered; without CUDA, nothing is. Returns the cap and a line for the user. Raises InputError if
-    the budget leaves no room for Gaussians.
+    `max_gaussians` is lowered; without CUDA, nothing is. Returns the cap and a line; raises InputError if none fit.
     """
     device, n = params["means"].device, len(params["means"])
     free, total = memory.available_bytes(device)

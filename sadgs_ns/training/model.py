@@ -100,8 +100,7 @@ class SadgsModel(SplatfactoModel):
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as many as the cap allows; call before optimizers are made. Return their number.
 
-        They have means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], in world units; the
-        distance to neighbours limits these, too.
+        Means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], which neighbours also limit.
         """
         room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
         if not room:

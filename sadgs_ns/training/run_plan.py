@@ -74,8 +74,7 @@ def plan_rates(
 ) -> dict[str, Rate]:
     """Derive a run's learning rates from nerfstudio's configurations, which are for steps of one view.
 
-    The rate of positions is in proportion to the cameras' extent, as in 3DGS. With `follow_views`, some rates change
-    with the views of a step (`RATES_OF_FOUR_VIEWS`).
+    That of positions is in proportion to the cameras' extent, as in 3DGS; `follow_views` uses `RATES_OF_FOUR_VIEWS`.
     """
     rates = {}
     for name, group in configs.items():
