@@ -645,6 +645,21 @@ def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp
     assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
 
 
+@pytest.mark.hard_case("a phone's panorama of a part of the view among the photos", "left out, with a line")
+def test_panoramas_of_a_part_of_the_view_are_left_out(tmp_path: Path):
+    exif, view = Image.Exif(), next(draw_photos())
+    exif[0x8769] = {0xA401: 6}  # Apple's number of a panorama
+    google = b'<rdf:Description GPano:ProjectionType="cylindrical"/>'
+    for name, size, more in (
+        ("apple.jpg", (300, 80), {"exif": exif}), ("google.jpg", (300, 90), {"xmp": google}),
+        ("whole.jpg", (200, 100), {"xmp": google}), ("wide.jpg", (300, 70), {}), ("photo.jpg", (160, 120), {}),
+    ):  # fmt: skip
+        view.resize(size).save(tmp_path / name, **more)
+    found, _, told = look_into(tmp_path, tmp_path / "out")
+    assert found == ["photo.jpg", "whole.jpg", "wide.jpg"]
+    assert told == ["Left out as panoramas of a part of the view: 2, such as apple.jpg."]
+
+
 @pytest.mark.hard_case("masks of two colours, such as black and red, or of 0 and 128", "the brighter one is white")
 @pytest.mark.parametrize("bright", [(255, 255, 255), (128, 128, 128), (200, 0, 0), (1, 1, 1)])
 def test_the_brighter_colour_of_a_mask_is_white(bright: tuple[int, int, int], tmp_path: Path):

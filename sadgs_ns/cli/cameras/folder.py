@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import ExifTags, Image, ImageOps
 
 from sadgs_ns.cli.program import read_settings
 from sadgs_ns.data import IMAGE_SUFFIXES
@@ -119,7 +119,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     maps = [name for name in found["masks"] if _is_mask(folder / name)]
     photos = sorted({*found["photos"], *found["masks"]} - {*maps})
     found["copies of others"] = copies = _copies(folder, photos, known)
-    photos = [name for name in photos if name not in copies]
+    found["panoramas of a part of the view"] = swept = [p for p in photos if p not in known and _is_swept(folder / p)]
+    photos = [name for name in photos if name not in {*copies, *swept}]
     for name in photos:
         stems[_stem(name)].append(name)
     for name in maps:
@@ -164,6 +165,15 @@ def _is_mask(path: Path) -> bool:
         return False
     is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
     return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
+
+
+def _is_swept(path: Path) -> bool:
+    """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
+    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
+        is_whole, lens = image.width == 2 * image.height, Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
+        by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
+        return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
+    return False
 
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
