@@ -51,7 +51,7 @@ class CudaGraphs:
         """Capture what a function launches, without running it, and return one that replays it.
 
         The results of all replays are the same tensors. The function may launch only kernels that were launched before,
-        since none may be compiled meanwhile. Raises as the function, or RuntimeError. torch's context manager would wait.
+        since none may be compiled meanwhile. Raises as the function or RuntimeError; torch's own context would wait.
         """
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(self._stream):
