@@ -389,11 +389,15 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
     "macOS's `._photo.jpg`, `.thumbnails/`, a folder named `x.png`, a link to the photos' own folder", "no photos"
 )
 @pytest.mark.hard_case("names that are no Unicode, or with line breaks", "refused by name: rename it")
+@pytest.mark.hard_case("names with the narrow space of macOS's screenshots, or joined emoji", "work")
 def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, "a.png", "b.png", "c.png", "._a.png", ".thumbnails/a.png", "folder.png/d.png")
     (tmp_path / "around").symlink_to(tmp_path)
     names = ["a.png", "b.png", "c.png", "folder.png/d.png"]
     assert find_source(tmp_path, tmp_path / "out") == (names, False, {}, [])
+    names.append("shot at 3.04\u202fPM \N{FAMILY}\u200d.png")
+    black(tmp_path, names[-1])
+    assert find_source(tmp_path, tmp_path / "out")[0] == names
     black(tmp_path, "line\nbreak.png")
     with pytest.raises(InputError, match=r"unprintable characters in its name, 'line.nbreak.png': rename it"):
         find_source(tmp_path, tmp_path / "out")

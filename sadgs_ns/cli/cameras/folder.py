@@ -53,7 +53,7 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
         told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
         raise InputError(" ".join([told, *others]))
     for name in photos:
-        if not name.isprintable():
+        if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
     return photos, False, masks, others
 
