@@ -80,7 +80,7 @@ class ProgressTable(LocalWriter):
     """nerfstudio's table of progress with the loss, PSNR and number of Gaussians.
 
     A terminal shows the latest `max_log_size` rows in place, other output above them, and the banner, such as the
-    viewer's address, below. Elsewhere, as in a file, every row is a line. A row alone reads from the device.
+    viewer's address, below. Elsewhere, as in a file, every row is a line. Loss and PSNR are read for rows only.
     """
 
     def __init__(self, config: LocalWriterConfig, banner_messages: list[str] | None = None) -> None:
