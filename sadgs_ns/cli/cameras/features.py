@@ -106,8 +106,7 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
         rig.rig_id = opened.write_rig(rig)
     frame = pycolmap.Frame(rig_id=rig.rig_id)
     for sensor, name in zip(sorted(rig.sensor_ids(), key=lambda sensor: sensor.id), views, strict=True):
-        image_id = opened.write_image(pycolmap.Image(name=name, camera_id=sensor.id))
-        frame.add_data_id(pycolmap.data_t(sensor, image_id))
+        frame.add_data_id(pycolmap.data_t(sensor, opened.write_image(pycolmap.Image(name=name, camera_id=sensor.id))))
     opened.write_frame(frame)
 
 
