@@ -147,7 +147,7 @@ class TransformsParser(_PointsOfPly, Nerfstudio):
         if model.exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
         meta = read_transforms(path)
-        self._middle, middle = _centre(meta)
+        self._middle, middle = _centre(meta, self.config.center_method)
         with mock.patch.object(nerfstudio_dataparser, "load_from_json", lambda _: meta):
             outputs = super()._generate_dataparser_outputs(split)
         source = colmap.points_file(model)
@@ -171,7 +171,7 @@ class ColmapParser(ColmapDataParser):
             masks, images = config.data / config.masks_path, (config.data / config.images_path).as_posix()
             for frame in described["frames"]:
                 frame["mask_path"] = (masks / mask_name(masks, os.path.relpath(frame["file_path"], images))).as_posix()
-        self._middle = _centre(described)[1]
+        self._middle = _centre(described, config.center_method)[1]
         return described
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Tensor]:
@@ -185,14 +185,18 @@ OWN: dict[type, type] = {own.__bases__[-1]: own for own in (_Blender, ColmapPars
 """This package's parser in the place of each of nerfstudio's."""
 
 
-def _centre(meta: Mapping[str, Any]) -> NDArray[np.float64]:
+def _centre(meta: Mapping[str, Any], method: str) -> NDArray[np.float64]:
     """Move poses that are far from the origin, as on a map, there; others stay, which is a translation by zeros.
 
-    nerfstudio would round them to float32 first. Return the translation in the frames of poses and of the data. [2, 3]
+    nerfstudio would round them first; raise InputError if it shall not centre them and rounds them coarsely. Return the
+    translation in the frames of the poses and of the data. [2, 3]
     """
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float64)  # [V, 4, 4]
     middle = np.median(poses[:, :3, 3], axis=0)
-    middle *= np.abs(middle).max() > _FAR * np.ptp(poses[:, :3, 3], axis=0).max()
+    distance, extent = np.abs(middle).max(), np.ptp(poses[:, :3, 3], axis=0).max()
+    if method == "none" and distance > 1000 * extent:
+        raise InputError("--center-method none leaves the cameras where float32 rounds their places: leave it out.")
+    middle *= method != "none" and distance > _FAR * extent
     for frame, pose in zip(meta["frames"], poses, strict=True):
         pose[:3, 3] -= middle
         frame["transform_matrix"] = pose

@@ -291,6 +291,19 @@ def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDat
     np.testing.assert_allclose(here - by, there, atol=1e-4)
 
 
+def test_poses_that_shall_not_be_centred_stay_or_are_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
+    data = Path(shutil.copytree(colmap.data, tmp_path / "scene"))
+    still = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+    parser = dataclasses.replace(colmap, data=data, assume_colmap_world_coordinate_convention=False, **still)
+    move_model(data / SPARSE_FOLDER, np.array([100.0, 0.0, 0.0]))
+    outputs = load(parser).train_dataparser_outputs
+    assert torch.equal(outputs.dataparser_transform, torch.eye(4)[:3])
+    assert outputs.cameras.camera_to_worlds[:, 0, 3].min() > 90
+    move_model(data / SPARSE_FOLDER, np.array([1e6, 0.0, 0.0]))
+    with pytest.raises(InputError, match=r"^--center-method none leaves the cameras where float32 rounds .*: leave it"):
+        load(parser)
+
+
 @pytest.mark.hard_case(
     "a COLMAP model as text beside another one in binary",
     "the text is read, with its own points; they were the other's",
