@@ -51,7 +51,7 @@ def check_machine() -> Iterator[Finding]:
         import torch
 
         _load_torchvision()
-    except Exception as error:  # A broken installation raises anything.
+    except Exception as error:  # A broken installation may raise anything.
         yield fault(f"torch cannot be used ({reason(error)}): install the versions of constraints.txt.")
         return
     with warnings.catch_warnings(record=True) as caught:  # torch warns of a driver that is too old.

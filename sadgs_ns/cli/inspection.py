@@ -50,7 +50,7 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     """Load a finished or running run from its `config.yml`, as nerfstudio's `eval_setup` does; options as `Inspect`'s.
 
     The file is read with PyYAML's full loader, which calls what it names. Checkpoints are looked for beside it. Return
-    the pipeline in evaluation mode, and its iterations; raise InputError if a file lacks, or is of another method.
+    the pipeline in evaluation mode, and its iterations; raise InputError if a file is missing or of another method.
     """
     if path.is_dir():
         path = path / "config.yml"
@@ -89,7 +89,7 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
     dataset = datamanager.train_dataset if training else datamanager.eval_dataset
     if not 0 <= index < len(dataset):
         raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
-    # Loading the images undistorts them, which changes the intrinsics.
+    # Undistorting the images changes the intrinsics.
     data = (datamanager.cached_train if training else datamanager.cached_eval)[index]
     camera = pipeline.model.pinhole(dataset.cameras[index : index + 1])
     if training:  # Poses may be learned.

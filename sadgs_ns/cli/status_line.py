@@ -1,4 +1,4 @@
-"""The lines of `sadgs`: how far each stage is, and where the time went."""
+"""The lines of `sadgs`: the progress of each stage, and where the time went."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StatusLine:
             self._console.print(self._text(), soft_wrap=True)
 
     def update(self, status: str) -> None:
-        """Show how far the stage is."""
+        """Show the progress of the stage."""
         self._status = status
 
     def finish(self, status: str) -> None:

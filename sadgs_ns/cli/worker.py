@@ -1,6 +1,6 @@
 """Run a function in another process, receive its events, and raise here what it raised there.
 
-A library that crashes, is killed for want of memory or ignores signals, such as COLMAP, then ends only that process.
+A library that crashes, runs out of memory or ignores signals, such as COLMAP, then ends only that process.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def main() -> None:
     returned = False
 
     def leave() -> None:
-        """Leave without taking apart all modules, which takes torch's most of a second."""
+        """Exit without tearing down all modules, which takes torch most of a second."""
         if returned:
             sys.stdout.flush()
             os._exit(0)

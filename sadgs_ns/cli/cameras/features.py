@@ -36,7 +36,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     """
     names = list(itertools.chain(*groups, *rigs))
     progress("features", 0, len(names))
-    rename_images(database, UNLISTED)  # A run that was interrupted while it matched has left them.
+    rename_images(database, UNLISTED)  # A run that was interrupted during matching left them.
     with pycolmap.Database.open(database) as opened:
         done_before = {image.name for image in opened.read_all_images() if opened.exists_descriptors(image.image_id)}
     searched, done = [name for name in names if name not in done_before], len(done_before)
@@ -45,7 +45,7 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
         for start in range(0, len(searched), _AT_ONCE):
             lot, masks = searched[start : start + _AT_ONCE], database.with_name("masks")
             found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in lot}
-            _add_images(database, photos, groups, rigs, {*lot})  # It takes a while, because COLMAP reads each photo.
+            _add_images(database, photos, groups, rigs, {*lot})  # This takes a while, because COLMAP reads each photo.
             with pycolmap.Database.open(database) as opened:
                 for image in (image for image in opened.read_all_images() if image.name in found):
                     keypoints, descriptors = found.pop(image.name).result()

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 _SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
 _TRIALS = 2000
-"""Random samples after which COLMAP gives a pair of photos up. Its own 10,000 take three times as long, for pairs with
-hardly anything in common, and find no more matches in the others."""
-_PAIRS = 50  # Pairs of photos that COLMAP matches, saves and reports together; for each lot it starts its threads anew
+"""Random samples after which COLMAP gives up on a pair of photos. Its own 10,000 take three times as long, for pairs
+with hardly anything in common, and find no more matches in the others."""
+_PAIRS = 50  # Pairs of photos that COLMAP matches, saves and reports at a time; it starts its threads for each batch
 _ADJUSTMENT = {
     "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
     "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
@@ -91,7 +91,7 @@ def make_model(
 
 @cache
 def begin_imports() -> tuple[Future[torch.device | None], Future[ModuleType]]:
-    """Begin the imports of torch and of nerfstudio's writer of scenes in a thread, because they take seconds."""
+    """Begin to import torch and nerfstudio's writer of scenes in a thread, because that takes seconds."""
     pool = ThreadPoolExecutor(1)
     return pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
 
@@ -104,7 +104,7 @@ def wake_gpu() -> torch.device | None:
     if not torch.cuda.is_available():
         return None
     device = torch.device("cuda")
-    torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first ones on a device start it.
+    torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first operations on a device start it.
     return device
 
 
@@ -167,7 +167,7 @@ def match(
         from sadgs_ns.cli.cameras.matching import write_matches
 
         write_matches(database, pairs, gpu, stage)
-        # It tries pairs again that did not fit, so all are verified together.
+        # It verifies pairs that failed again each time, so all are verified in one call.
         pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     else:
         rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
@@ -204,7 +204,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
 
         def advance(more: int) -> None:
             nonlocal registered
-            registered = min(registered + more, total)  # COLMAP counts on where it begins another model.
+            registered = min(registered + more, total)  # COLMAP goes on counting when it begins another model.
             progress(stage, registered, total)
 
         advance(0)
