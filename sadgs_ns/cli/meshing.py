@@ -64,10 +64,7 @@ def write_mesh(
 
 
 def derive_voxel_size(views: Sequence[DepthView]) -> float:
-    """Return an edge of two pixels at the median depth, or larger so that a mesh of such views fits in memory.
-
-    Raise InputError if they see no surface, or open3d cannot be imported.
-    """
+    """Return an edge of 2 px at the median depth, or what memory allows; raise InputError without surface or open3d."""
     pixels = [np.median(view.depth[view.depth > 0]) / view.focal for view in views if (view.depth > 0).any()]
     if not pixels:
         raise InputError("The training views see no surface that is half opaque: train longer, or take less away.")

@@ -113,10 +113,7 @@ def from_data(path: Path) -> Similarity:
 
 
 def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
-    """Return the map to nerfstudio's world that the content of a `transforms.json` fixes; None if nerfstudio decides.
-
-    Raise InputError if it is no similarity.
-    """
+    """Return the map to nerfstudio's world that `meta` fixes, or None; raise InputError if it is no similarity."""
     if not any(name in meta for name in FRAME_KEYS):
         return None
     try:

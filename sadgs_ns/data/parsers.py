@@ -65,10 +65,7 @@ CHECKS = {
 
 
 def choose_parser(config: FullImageDatamanagerConfig) -> None:
-    """Replace the automatic parser by the one that fits the data, so that a run's `config.yml` names that one.
-
-    Raise InputError if the folder cannot be read.
-    """
+    """Replace the automatic parser by one that fits, which `config.yml` names; raise InputError for unreadable data."""
     if not isinstance(config.dataparser, AutomaticDataParserConfig):
         return
     data = Path(config.data or config.dataparser.data)

@@ -45,10 +45,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 
 def _read_vertices(path: Path) -> NDArray[Any]:
-    """Return the vertices as a structured array [P].
-
-    plyfile reads the header and binary vertices; numpy reads text, where plyfile takes 30 µs a point.
-    """
+    """Return the vertices as a structured array [P]; numpy reads text, where plyfile takes 30 µs a point."""
     from plyfile import PlyData
 
     with path.open("rb") as file:

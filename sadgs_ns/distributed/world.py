@@ -58,10 +58,7 @@ class World:
         return [(r + 1) * total // self.num_ranks - r * total // self.num_ranks for r in range(self.num_ranks)]
 
     def take_even_part(self, total: int) -> slice:
-        """Let each process hold an equal shard of Gaussians that all of them have, and return this one's.
-
-        Raise InputError if there are fewer Gaussians than processes.
-        """
+        """Share Gaussians out that all processes have, and return this one's; raise InputError if they are too few."""
         if total < self.num_ranks:
             raise InputError(f"{self.num_ranks} processes cannot share out {total} Gaussians: start fewer processes.")
         self.sizes = self.even_sizes(total)
@@ -123,10 +120,7 @@ class World:
         return max(self.sizes) > REBALANCED_BEYOND * min(self.sizes)
 
     def rebalance(self, rows: Tensor) -> Tensor:
-        """Return this process's rows after all are spread evenly in their order. [N, …] → [N', …]
-
-        `sizes` stays as it is, so that several tensors can be spread.
-        """
+        """Return this process's rows after all are spread evenly; `sizes` stays, for other tensors. [N, …] → [N', …]"""
         new = self.even_sizes(self.total)
         sent, received = _overlaps(self.sizes, new, self.rank), _overlaps(new, self.sizes, self.rank)
         result = rows.new_empty((new[self.rank], *rows.shape[1:]))

@@ -1,7 +1,4 @@
-"""Files of Gaussians and meshes: each module writes one format, and knows neither torch nor nerfstudio.
-
-A new format is a module with a function `write` and a line in `FORMATS`.
-"""
+"""Files of Gaussians and meshes: each module writes one format, and knows neither torch nor nerfstudio."""
 
 from __future__ import annotations
 

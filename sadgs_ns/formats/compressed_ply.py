@@ -51,10 +51,7 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
 
 
 def _in_chunk(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return values as shares, in [0, 1], between the extremes of their chunk, and these, lowest first.
-
-    [N, 3] → [N, 3], [chunks, 6]
-    """
+    """Return values [N, 3] as shares between their chunk's extremes, in [0, 1], and these, lowest first [chunks, 6]."""
     starts = np.arange(0, len(values), _CHUNK)
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     chunk = np.arange(len(values)) // _CHUNK

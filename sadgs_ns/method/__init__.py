@@ -1,4 +1,1 @@
-"""The method: image → structure tensor map → η → statistics → split plan → new parameters.
-
-It needs torch and gsplat alone, so that any training loop can use it.
-"""
+"""The method: image → structure tensor map → η → statistics → split plan → parameters, with torch and gsplat alone."""

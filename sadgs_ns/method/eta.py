@@ -21,10 +21,7 @@ WAVELENGTH_EPSILON = 1e-5
 def principal_eigenvalue(
     structure_tensor: Tensor,  # [..., 3]
 ) -> Tensor:
-    """Larger eigenvalue λ_1 of symmetric 2×2 tensors (xx, xy, yy), in closed form. [...]
-
-    Both terms are non-negative, so that nothing cancels, however close to isotropic the tensor is.
-    """
+    """Larger eigenvalue λ_1 of symmetric 2×2 tensors (xx, xy, yy), in a closed form in which nothing cancels. [...]"""
     xx, xy, yy = structure_tensor.unbind(-1)
     return 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
 
@@ -122,8 +119,5 @@ def eta(
     axes: Tensor,  # [M, 3, 2]
     structure_tensor: Tensor,  # [M, 3]
 ) -> Tensor:
-    """Frequency violation of each axis: η_k = ‖v_k‖ / Λ_min (paper, eq. 6). [M, 3]
-
-    The arguments are results of `projected_axes` and `sample_map`.
-    """
+    """η_k = ‖v_k‖ / Λ_min of each axis (paper, eq. 6), of results of `projected_axes` and `sample_map`. [M, 3]"""
     return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]

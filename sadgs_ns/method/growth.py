@@ -99,10 +99,7 @@ def due_rule(iteration: int, windows: Windows) -> Rule | None:
 
 @torch.no_grad()
 def apply(proposal: Proposal, allowed: Tensor, params: Params, optimizers: Optimizers, state: State) -> None:
-    """Let the `allowed` Gaussians, bool [N], grow as proposed, in place.
-
-    New Gaussians start with empty rows of every tensor in `state`.
-    """
+    """Let the `allowed` Gaussians, bool [N], grow as proposed, in place; new ones have empty rows in `state`."""
     counts = torch.where(allowed[:, None], proposal.children, 1)
     if proposal.clone is not None and (num_clones := int((is_clone := allowed & proposal.clone).sum())) > 0:
         duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]

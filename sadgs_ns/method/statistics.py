@@ -1,7 +1,4 @@
-"""η observations → per-Gaussian multiview statistics (paper, section 3.4).
-
-They are tensors with leading dimension N in a gsplat strategy's state, where gsplat keeps them in step with parameters.
-"""
+"""η observations → per-Gaussian multiview statistics (paper, section 3.4), tensors [N, …] in a strategy's state."""
 
 from __future__ import annotations
 

@@ -172,10 +172,7 @@ def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tup
 
 @dataclass(frozen=True)
 class _WeightedSums:
-    """Gaussian blurs of the valid pixels and of the pixels' weights: their quotient is a weighted mean.
-
-    Outside the image there are zeros, which weigh nothing.
-    """
+    """Gaussian blurs of valid pixels and of their weights, 0 outside the image; their quotient is a weighted mean."""
 
     weight: Tensor  # 1 at valid pixels and 0 at masked ones [B, 1, H, W], or [1, 1, H, W] of ones without masks
     masked: bool

@@ -1,7 +1,4 @@
-"""Gaussian splatting in plain torch, as gsplat draws, in float32 or float64, on any device.
-
-Compositing takes chunks of (pixel, Gaussian) pairs, again in the backward pass, so the memory has a bound.
-"""
+"""Gaussian splatting in plain torch, as gsplat draws, in float32 or float64, by chunks that bound the memory."""
 
 from __future__ import annotations
 
@@ -92,11 +89,7 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
 def _project(
     means: Tensor, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, width: int, height: int, near: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Project the Gaussians as EWA splatting does.
-
-    Returns:
-        means2d [C, N, 2], depths [C, N], conics [C, N, 3], covars2d [C, N, 2, 2], valid [C, N].
-    """
+    """Project as EWA does: means2d [C, N, 2], depths [C, N], conics [C, N, 3], covars2d [C, N, 2, 2], valid [C, N]."""
     means_c, covars_c = world_to_camera(means, covariances(quats, scales), viewmats)  # [C, N, 3], [C, N, 3, 3]
     depths = means_c[..., 2]
     valid = (depths >= near) & (depths <= FAR_PLANE)

@@ -60,10 +60,7 @@ def wait() -> None:
 
 
 def _marker() -> Path | None:
-    """Return the file in Triton's cache that says that this was done, or None if it should not be done.
-
-    This imports neither torch nor Triton, which would take a second.
-    """
+    """Return the file in Triton's cache that says that this was done, or None if it should not be; imports no torch."""
     cards = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
     if not cards or len(os.sched_getaffinity(0)) < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
         return None

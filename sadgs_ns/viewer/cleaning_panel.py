@@ -1,7 +1,4 @@
-"""The viewer's panel for cleaning: sliders, how many Gaussians they would remove, and what that looks like.
-
-It removes nothing: `sadgs-export` does, with the options that the panel prints.
-"""
+"""The viewer's panel for cleaning, which shows what `sadgs-export` removes with the options that the panel prints."""
 
 from __future__ import annotations
 

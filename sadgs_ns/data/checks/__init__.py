@@ -1,7 +1,4 @@
-"""Checks of a data folder before nerfstudio parses it; each finding is a sentence on what would go wrong.
-
-A few hundred images take under a second. Nothing here needs torch or nerfstudio.
-"""
+"""Checks of a data folder before nerfstudio parses it, in under a second for a few hundred images, without torch."""
 
 from __future__ import annotations
 
