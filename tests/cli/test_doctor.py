@@ -74,8 +74,8 @@ def test_it_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: 
         assert f"{package} {version(package)}" in lines[0].split(", ")
     scene = tmp_path / "scene"
     assert lines[-3:] == [
-        f"note: {scene}/sparse/0/points3D.bin has 20 points.",
         f"note: {scene}/sparse/0/images.bin has 9 images of 32 × 24 px, PNG RGB, without masks.",
+        f"note: {scene}/sparse/0/points3D.bin has 20 points.",
         f"Next: ns-train sadgs --data {scene}",
     ]
     assert all(re.fullmatch(r"(note|warning|error): .+\.", line) for line in lines[1:-1])

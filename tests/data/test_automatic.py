@@ -45,7 +45,9 @@ def colmap_in(folder: str) -> Callable[[Path, Path], None]:
 
 def beside_a_reconstruction(scene: Path, data: Path) -> None:
     nerfstudio_data(data)
-    shutil.copytree(scene / SPARSE_FOLDER, data / "colmap/sparse/0")
+    model = data / "colmap/sparse/0"
+    shutil.copytree(scene / SPARSE_FOLDER, model, ignore=shutil.ignore_patterns("points3D.*"))
+    (model / "points3D.txt").write_text("1 0.5 0.5 -0.5 90 90 90 0\n")  # The scene's points are not of these photos.
 
 
 def named_with_folder(scene: Path, data: Path) -> None:

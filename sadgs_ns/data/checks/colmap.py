@@ -42,25 +42,25 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     lists = {split: read_text(file).splitlines() for split, file in files.items() if file.is_file()}
     training = yield from check_splits(names, lists, lambda split: f"{files[split]}", folder.joinpath, options)
     sound = yield from check_views(views, training, poses_path)
+    if options.masks_path is None and images.images_in(data / "masks"):
+        problem = f"{data / 'masks'} holds masks that are not used"
+        yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
+    if open_images:
+        factor = yield from _check_factor(folder, names, options)
+        masks, frames = None if options.masks_path is None else data / options.masks_path, []
+        for name, camera in zip(names, (view.camera for view in views), strict=True):
+            size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
+            mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
+            frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
+        yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
+        views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
         if (points := colmap.points_file(model_folder)) is None:
             yield fault(f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}.")
         else:
             remedy = f"run COLMAP's mapper again, or {random}"
-            yield from check_points(colmap.read_points(points)[0], views if sound else [], points, remedy)
-    if options.masks_path is None and images.images_in(data / "masks"):
-        problem = f"{data / 'masks'} holds masks that are not used"
-        yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
-    if not open_images:
-        return
-    factor = yield from _check_factor(folder, names, options)
-    masks, frames = None if options.masks_path is None else data / options.masks_path, []
-    for name, camera in zip(names, (view.camera for view in views), strict=True):
-        size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
-        mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
-        frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
-    yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
+            yield from check_points(colmap.read_points(points), views if sound else [], points, remedy)
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
@@ -120,10 +120,7 @@ def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[V
 
 
 def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
-    """Return the factor by which the images are scaled down that will be read.
-
-    If they do not exist, raise InputError unless somebody can answer nerfstudio's question whether to make them.
-    """
+    """Return the downscale factor of the images to read; raise InputError if none exist and nobody can be asked."""
     factor = options.downscale_factor or images.automatic_factor(folder / names[0])
     smaller = images.smaller_folder(folder, factor)
     if factor == 1 or all((smaller / name).parent.exists() for name in names):

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sadgs_ns.data import IMAGE_SUFFIXES
@@ -234,6 +235,16 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
         image.verify()  # This reads its checksums.
         return True
     return False
+
+
+def read_small(path: Path) -> NDArray[np.uint8] | None:
+    """Return an image's colours [H, W, 3], of a JPEG scaled down as it is decoded; None if it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            image.draft("RGB", (160, 160))  # It keeps at least as many px.
+            return np.asarray(image.convert("RGB"))
+    except Exception:  # `check_images` tells of broken images.
+        return None
 
 
 def _is_flat(path: Path, black: bool = False) -> bool:

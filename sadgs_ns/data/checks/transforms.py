@@ -53,9 +53,9 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     for frame in described:
         where, mask = f"{path}: frame {frame['file_path']}", frame.get("mask_path")
         geometry.check_positive(frame, where, _PINHOLE)
-        views.append(view_of(frame, where, _camera(frame, model, where)))
-        size = scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor")
-        frames.append(Frame(locate(frame["file_path"]), size, None if mask is None else locate(mask, "masks")))
+        size, image = scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor"), locate(frame["file_path"])
+        views.append(view_of(frame, where, _camera(frame, model, where), image if open_images else None))
+        frames.append(Frame(image, size, None if mask is None else locate(mask, "masks")))
     for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
         if 0 < (having := sum(name in frame for frame in described)) < len(frames):
             problem = f"{path} names {what} for {having} of {len(frames)} frames"
@@ -91,7 +91,10 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
                 if abs(geometry.finite(values.get(name, value), name, str(path)) - value) > 1e-3 * value:
                     raise InputError(f"{path}: of Blender scenes {name} is not read; rename it to transforms.json.")
         camera = geometry.Camera(width, height, focal, focal, width / 2, height / 2)
-        views = [view_of(frame, f"{path}: frame {frame['file_path']}", camera) for frame in described]
+        views = [
+            view_of(frame, f"{path}: frame {frame['file_path']}", camera, image if open_images else None)
+            for frame, image in zip(described, images, strict=True)
+        ]
         if split == "train":
             sound = yield from geometry.check_views(views, len(views), path)
             distance = float(np.median([np.linalg.norm(view.centre) for view in views]))
@@ -230,10 +233,11 @@ def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
     return frames
 
 
-def view_of(frame: dict[str, Any], where: str, camera: geometry.Camera) -> geometry.View:
+def view_of(frame: dict[str, Any], where: str, camera: geometry.Camera, image: Path | None) -> geometry.View:
     """Return the view of a frame that `frames_of` found good."""
     pose = np.array(frame["transform_matrix"], dtype=np.float64)
-    return geometry.View(where, where, (pose[:3, :3] * [1, -1, -1]).T, pose[:3, 3], camera)  # The axes become OpenCV's.
+    rotation = (pose[:3, :3] * [1, -1, -1]).T  # The axes become OpenCV's.
+    return geometry.View(where, where, rotation, pose[:3, 3], camera, image)
 
 
 def _camera(values: dict[str, Any], model: str, where: str) -> geometry.Camera:
@@ -262,8 +266,9 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
-        positions, transform = colmap.read_points(source)[0], np.array(meta["applied_transform"], float)
-        positions = positions @ transform[:, :3].T + transform[:, 3]
-        yield from geometry.check_points(positions, views, source, "run COLMAP's mapper again")
+        (positions, colors), transform = colmap.read_points(source), np.array(meta["applied_transform"], float)
+        points = positions @ transform[:, :3].T + transform[:, 3], colors
+        random = "end the command with `nerfstudio-data --load-3D-points False` to start from random points"
+        yield from geometry.check_points(points, views, source, f"run COLMAP's mapper again, or {random}")
     else:
         yield note(f"{path} has no ply_file_path: training will start from random points.")
