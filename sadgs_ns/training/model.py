@@ -119,8 +119,8 @@ class SadgsModel(SplatfactoModel):
         """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it."""
         if self.config.clear_paths:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
-            if self.config.random_init and self.seed_points is not None:
-                surfaces = self.seed_points[0].to(surfaces)
+            if self.seed_points is not None:  # From those near cameras no Gaussian starts.
+                surfaces = torch.cat([surfaces, self.seed_points[0].to(surfaces)])
             self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
 
     def shard(self, world: World) -> None:

@@ -146,13 +146,18 @@ def test_the_cameras_paths_are_kept_clear_if_the_options_ask_for_it(asked: bool,
     assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == asked
 
 
-@pytest.mark.hard_case("random points to start from beside SfM points", "these still tell surfaces from haze")
-def test_sfm_points_are_of_surfaces_if_a_run_starts_from_random_ones(config: Any):
-    config.pipeline.model.stereo_points, states = 0, []
-    for config.pipeline.model.random_init in (True, False):
-        states.append(set_up(config).pipeline.model.strategy_state)
-    ours, usual = (state["camera_paths"].points for state in states)
-    assert len(usual) > 0 and (usual[:, None] == ours).all(dim=2).any(dim=1).all()
+@pytest.mark.hard_case(
+    "SfM points from which no Gaussian starts, near cameras or because random ones are wanted",
+    "these still tell surfaces from haze",
+)
+def test_sfm_points_are_of_surfaces_if_no_gaussian_starts_from_them(config: Any, monkeypatch: pytest.MonkeyPatch):
+    config.pipeline.model.stereo_points, points = 0, []
+    for clearance, config.pipeline.model.random_init in ((0.0, False), (20.0, False), (0.0, True)):
+        monkeypatch.setattr("sadgs_ns.training.model.CAMERA_CLEARANCE", clearance)
+        model = set_up(config).pipeline.model
+        points.append({tuple(point) for point in model.strategy_state["camera_paths"].points.tolist()})
+        assert (model.num_points < 300) is (clearance > 0)
+    assert points[0] == points[1] == points[2] != set()
 
 
 def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
