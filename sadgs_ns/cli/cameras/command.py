@@ -161,7 +161,7 @@ def process(options: Process) -> Summary:
             with Progress(*columns, disable=not sys.stdout.isatty()) as progress:
                 summary = _make(scene, _reporter(progress))
     print(summary)
-    for sentence in filter(None, [summary.zooms, *scene.left_out]):
+    for sentence in scene.left_out:
         _say("aside", sentence)
     if not scene.is_video and (videos := find_videos(options.source)):
         told = f"Its videos ({len(videos)}, such as {videos[0]}) are not used: give them in a folder of their own."

@@ -160,7 +160,7 @@ def _is_mask(path: Path) -> bool:
     """Return whether an image has two colours at most, or nearly all of it is black or white."""
     try:
         with Image.open(path) as image:
-            pixels = np.reshape(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST), (-1, 3))
+            pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)).reshape(-1, 3)
     except Exception:  # A damaged image is named when it is read.
         return False
     is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)

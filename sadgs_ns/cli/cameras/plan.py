@@ -21,7 +21,6 @@ class Summary:
     left_out: dict[str, str]  # The reason for each photo that did not register
     matching: Matching
     attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
-    zooms: str = ""  # A sentence on photos that may not be of the camera to which they were counted
 
     def __str__(self) -> str:
         found = f"{self.registered} of {self.photos} photos registered, {self.points:,} points, mean reprojection error"

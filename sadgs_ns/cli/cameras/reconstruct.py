@@ -6,7 +6,6 @@ Each stage goes on where an interrupted run left it. Only the process of `colmap
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 import itertools
 import json
@@ -333,24 +332,4 @@ def summarize(
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()
-    zooms = zooms_told(model)
-    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts, zooms)
-
-
-def zooms_told(model: pycolmap.Reconstruction) -> str:
-    """Return a sentence if photos of another focal length seem to share a camera with others, or else nothing."""
-    differing, options = [], pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True)
-    for image in (image for image in model.images.values() if image.has_pose):
-        seen = [point for point in image.points2D if point.has_point3D()]
-        if len(seen) >= 30 and len(image.camera.params) == 8:  # of OPENCV, unlike the views of panoramas
-            pixels, points = [point.xy for point in seen], [model.points3D[point.point3D_id].xyz for point in seen]
-            camera, inliers = copy.copy(image.camera), np.ones(len(seen), bool)
-            pycolmap.refine_absolute_pose(image.cam_from_world(), pixels, points, inliers, camera, options)
-            if abs(np.log(camera.focal_length_x / image.camera.focal_length_x)) > 0.05:
-                differing.append(image.name)
-    if len(differing) <= max(2, 0.15 * model.num_reg_images()):  # .06 of them did where none was of another one.
-        return ""
-    told = (
-        f"The focal lengths of {len(differing)} photos, such as {min(differing)}, seem to differ from those of others"
-    )
-    return f"{told} of one size, so cameras are wrong: give the original files, whose EXIF tells of lenses and zooms."
+    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts)
