@@ -76,9 +76,9 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
     elif layout == "colmap":
-        known = {field.name for field in fields(ColmapDataParserConfig)}
-        options = {name: value for name, value in vars(automatic_options(data)).items() if name in known}
-        config.dataparser = ColmapDataParserConfig(data=data, **options)
+        options = vars(automatic_options(data))
+        chosen = ("colmap_path", "images_path", "downscale_factor", "downscale_rounding_mode")
+        config.dataparser = ColmapDataParserConfig(data=data, **{name: options[name] for name in chosen})
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)
 

@@ -143,4 +143,5 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
     """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
     pixels = max((w * h * min(1.0, MAX_SIDE / max(w, h, 1)) ** 2 for w, h in sizes), default=1.0)
-    return max(1, int(min(os.cpu_count() or 1, 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels))))
+    at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
+    return max(1, int(min(os.cpu_count() or 1, at_a_time)))
