@@ -21,12 +21,12 @@ DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
 
 
 def number(value: float | None, digits: int, signed: bool = False) -> str:
-    """A number with a real minus; three digits and more, which are of measures up to 1, go without a leading 0."""
+    """A number with a real minus, and without a leading 0 before two digits or more."""
     if value is None:
         return NOTHING
     rounded = round(value, digits)
     text = f"{abs(rounded):.{digits}f}"
-    text = text.removeprefix("0") if digits > 2 else text
+    text = text.removeprefix("0") if digits > 1 else text
     return ("−" if rounded < 0 else "+" if rounded > 0 and signed else "") + text
 
 

@@ -98,15 +98,15 @@ def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
     # Castle is the mean of its two scenes; its second setting lacks one of them.
     assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
-    assert lines[1] == "| standard deviation | 0.25 / .0000 / .0000 | – |"
-    assert lines[2] == "| × 2 | −0.25 / +.0100 / −.0100 / ×1.50 ² | – |"
+    assert lines[1] == "| standard deviation | .25 / .0000 / .0000 | – |"
+    assert lines[2] == "| × 2 | −.25 / +.0100 / −.0100 / ×1.50 ² | – |"
 
 
 def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     rows = [row("fox", "T1", 0), row("fox", "T1", 1), row("fox", "T2", lpips=0.1 - 1e-9)]
     folder = checkout(tmp_path, {"sweep": {**SWEEP, "scenes": {"fox": ["fox"]}}}, {"sweep.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
-    assert "| × 2 | 0.00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
+    assert "| × 2 | .00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
 def test_approximations_are_printed_as_their_command_does(tmp_path: Path):
@@ -140,9 +140,9 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
     assert (folder / "README.md").read_text("utf8").splitlines()[4:10] == [
         "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Standard deviation | Scenes × seeds | Explanation |",
         "| --- | --- | --- | --- | --- | --- |",
-        "| × 2 | theirs | −1.00 to −0.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | 0.25 / .0000 / .0000 "
+        "| × 2 | theirs | −1.00 to −.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | .25 / .0000 / .0000 "
         "| 2 × 1 | why |",
-        "| × 2, fox |  | −0.25 / +.0100 / −.0100 / ×1.50 | 0.25 / .0000 / .0000 | 1 × 2 | why |",
+        "| × 2, fox |  | −.25 / +.0100 / −.0100 / ×1.50 | .25 / .0000 / .0000 | 1 × 2 | why |",
         "| nothing | theirs | not measured | – | – | no run |",
         "| without LPIPS |  | +1.00 / .0000 / – / ×1.00 | – | 1 × 1 | why |",
     ]

@@ -110,7 +110,7 @@ def test_single_views_of_all_folds_are_in_the_median_and_in_the_worst():
 def test_the_printed_table_pools_the_seeds_of_all_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rows = [result(scene, seed=seed) for scene in ("fox", "south") for seed in (0, 1)]
     assert bench.main(["table", write_lines(tmp_path / "r.jsonl", rows)]) == 0
-    told = "- ours: pooled standard deviation 0.71 / .0000 / .0000 of PSNR, SSIM and LPIPS over 2 scenes.\n"
+    told = "- ours: pooled standard deviation .71 / .0000 / .0000 of PSNR, SSIM and LPIPS over 2 scenes.\n"
     assert told in capsys.readouterr().out
 
 

@@ -656,7 +656,7 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
     model.means.data[:] = model.means.data[:1] + 1e-3 * torch.randn_like(model.means)
     pose = cameras.camera_to_worlds[:1].clone()
     for share, drawn in ((0.9, 0), (1.1, model.num_points)):
-        pose[0, :, 3] = model.means.data[0] + share * stored * pose[0, :, 2]
+        pose[0, :, 3] = model.means.data[0].cpu() + share * stored * pose[0, :, 2]
         viewmat = viewmats_from_camera_to_world(pose).to(model.device)
         Ks = cameras.get_intrinsics_matrices()[:1].to(model.device)
         _, _, info = model.render(Pinholes(viewmat, Ks, WIDTH, HEIGHT), model.color_options())
@@ -688,13 +688,14 @@ def test_after_the_viewer_has_rendered_the_whole_model_trains_again(trained: Sad
 def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
     model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
 
-    def accumulation(side: float, centre: float) -> torch.Tensor:
-        box = OrientedBox(R=torch.eye(3), T=torch.full((3,), centre), S=torch.full((3,), side))
+    def accumulation(x: float) -> torch.Tensor:
+        """Of what lies in a box of side 1,000 around (x, 0, 0)."""
+        box = OrientedBox(R=torch.eye(3), T=torch.tensor([x, 0.0, 0.0]), S=torch.full((3,), 1000.0))
         return model.get_outputs_for_camera(camera, obb_box=box)["accumulation"]
 
     everything = model.get_outputs_for_camera(camera)["accumulation"]
-    assert torch.equal(accumulation(1000.0, 0.0), everything)
-    middle = float(model.means.median())
-    assert 0 < accumulation(0.5, middle).sum() < everything.sum()
-    assert torch.equal(accumulation(0.5, 100.0), torch.zeros_like(everything))
+    assert torch.equal(accumulation(0.0), everything)
+    middle = float(model.means[:, 0].median())
+    assert 0 < accumulation(middle - 500.0).sum() < everything.sum()
+    assert torch.equal(accumulation(5000.0), torch.zeros_like(everything))
     assert torch.equal(model.get_outputs_for_camera(camera)["accumulation"], everything)
