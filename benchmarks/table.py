@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -212,7 +213,7 @@ _PRINTED += ("peak", "seeds")
 
 
 def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) -> str:
-    """Runs as a Markdown table, a line each, with some of COLUMNS.
+    """Runs as a Markdown table, a line each, with some of COLUMNS; the first is empty where it repeats the line above.
 
     Raises ValueError if there is no such column or, with `strict`, a number is missing.
     """
@@ -228,7 +229,9 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) ->
     if unknown := {*columns} - COLUMNS.keys():
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
     known = [COLUMNS[name] for name in columns]
-    lines = ([cell(column, run) for _, column in known] for run in runs)
+    lines = [[cell(column, run) for _, column in known] for run in runs]
+    for above, line in reversed(list(itertools.pairwise(lines))):
+        line[0] = line[0] if line[0] != above[0] else ""
     return grid([header for header, _ in known], lines, sum(name in WORDS for name in columns))
 
 
@@ -309,7 +312,7 @@ class Change:
 
 def of_changes(changes: Iterable[Change], header: Sequence[str], remark: str) -> str:
     """Changes as a Markdown table, a line each, from the least to the most that a scene changes by."""
-    numbers = ["PSNR / SSIM / LPIPS / Gaussians", "Standard deviation", "Scenes × seeds"]
+    numbers = ["PSNR / SSIM / LPIPS / Gaussians", "Spread", "Scenes × seeds"]
     return grid([*header, *numbers, remark], [change.cells() for change in changes], len(header) + 4)
 
 

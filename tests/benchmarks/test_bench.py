@@ -400,7 +400,7 @@ def test_table_means_over_seeds_and_ratio_to_the_reference():
     ]
     lines = markdown(rows, "base").splitlines()
     assert lines[2] == "| fox | base | 100.0 | 1.000 | – | 30.00 | – | – | .9000 | .1000 | 1,000 | 2.0 | 1 |"
-    assert lines[3].startswith("| fox | ours | 10.0 ± 1.0 | 0.100 | – | 31.00 ± 1.00 | – | – | .9000 ± .0000 | .1000, ")
+    assert lines[3].startswith("|  | ours | 10.0 ± 1.0 | 0.100 | – | 31.00 ± 1.00 | – | – | .9000 ± .0000 | .1000, ")
     assert lines[3].endswith(" | .1000, .1000 | 2,000k | 2.0 | 3 |")
     assert lines[4] == "| south | ours | 10.0 | – | – | 30.00 | – | – | .9000 | – | 1,000 | – | 1 |"
     assert lines[-1] == "- fox, ours, seed 2 failed: RuntimeError: out of memory"

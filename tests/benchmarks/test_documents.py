@@ -82,7 +82,7 @@ def test_runs_are_a_line_each(tmp_path: Path):
 | Scene: training views | Method | Loop s | Ratio | PSNR | Gaussians |
 | --- | --- | ---: | ---: | ---: | ---: |
 | fox: 43 of 0.68 MP | slow | 250.0 | 1 | 29.00 | 9,999 |
-| fox: 43 of 0.68 MP | ours | 10.0, 11.0 | 1/24 | 30.00, 31.00 | 200k |
+|  | ours | 10.0, 11.0 | 1/24 | 30.00, 31.00 | 200k |
 | tree: 43 | ours, elsewhere | 10.0 | – | 30.00 | 200k |
 
 <!-- end -->
@@ -138,7 +138,7 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
     folder = checkout(tmp_path, tables, {"sweep.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
     assert (folder / "README.md").read_text("utf8").splitlines()[4:10] == [
-        "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Standard deviation | Scenes × seeds | Explanation |",
+        "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Spread | Scenes × seeds | Explanation |",
         "| --- | --- | --- | --- | --- | --- |",
         "| × 2 | theirs | −1.00 to −.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | .25 / .0000 / .0000 "
         "| 2 × 1 | why |",
