@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageCms
 
 VIEWS, WIDTH, HEIGHT = 10, 160, 120
 WALLS = np.array(  # corners of the floor and two walls of a room, in the order of their textures' corners [3, 4, 3]
@@ -108,3 +108,11 @@ def draw_photo(centre: np.ndarray, rotation: np.ndarray, side: int, yaw: float =
     x, down, ahead = np.moveaxis(rays @ rotation.T, -1, 0)
     cosine, sine = np.cos(yaw), np.sin(yaw)
     return draw_hall(centre, np.stack([cosine * x + sine * ahead, cosine * ahead - sine * x, -down], -1))
+
+
+def color_profile(swapped: bool) -> bytes:
+    """The colour profile of sRGB, or one whose red is sRGB's green, and the other way round."""
+    content = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    for old, new in [("rXYZ", "----"), ("gXYZ", "rXYZ"), ("----", "gXYZ")] if swapped else ():
+        content = content.replace(old.encode(), new.encode())
+    return content.replace("sRGB".encode("utf-16-be"), "mine".encode("utf-16-be")) if swapped else content

@@ -37,7 +37,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image, ImageFilter
 from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
-from room import HEIGHT, VIEWS, WIDTH, camera_centres, draw_photos, walk_centres
+from room import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
 
 from sadgs_ns.cli.cameras import command as program
 from sadgs_ns.cli.cameras import features, reconstruct
@@ -830,6 +830,24 @@ def test_photos_in_cmyk_become_rgb(tmp_path: Path):
     folder, _ = convert_photos(tmp_path, read_photos(tmp_path, ["a.tif"], lambda *step: None), tmp_path / "converted")
     with Image.open(folder / "a.tif") as image:
         assert image.mode == "RGB"
+
+
+@pytest.mark.hard_case(
+    "photos with a profile of other colours, as phones have (Display P3)", "become sRGB, as viewers show"
+)
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_photos_with_a_profile_of_other_colors_become_srgb(suffix: str, tmp_path: Path):
+    srgb, swapped = color_profile(swapped=False), color_profile(swapped=True)
+    profiles = {"srgb": srgb, "other": swapped, "grey": swapped, "damaged": b"none"}
+    names = [f"{name}.{suffix}" for name in profiles]
+    for name, content in zip(names, profiles.values(), strict=True):
+        image = Image.new("RGB", (16, 16), (200, 40, 10)).convert("L" if name.startswith("grey") else "RGB")
+        image.save(tmp_path / name, icc_profile=content)
+    folder, _ = convert_photos(tmp_path, read_photos(tmp_path, names, lambda *step: None), tmp_path / "converted")
+    assert [(folder / name).is_symlink() for name in names] == [True, False, True, True]
+    with Image.open(folder / names[1]) as image:
+        assert np.abs(np.array(image)[8, 8].astype(int) - [40, 200, 10]).max() <= 6
+        assert image.info.get("icc_profile") != swapped
 
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")

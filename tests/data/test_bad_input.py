@@ -29,6 +29,7 @@ from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.scripts.train import entrypoint
 from PIL import Image, ImageFile
 from processes import HANGS
+from room import color_profile
 from runs import (
     blender_data,
     configure,
@@ -259,6 +260,13 @@ def store_turned(size: tuple[int, int], orientation: int) -> Callable[[Path], No
                 image.resize(size).save(path, exif=exif)
 
     return spoil
+
+
+def store_profile(data: Path) -> None:
+    """Give all images a colour profile that is not sRGB's."""
+    for path in images(data):
+        with Image.open(path) as image:
+            image.save(path, icc_profile=color_profile(swapped=True))
 
 
 def images(data: Path) -> list[Path]:
@@ -1036,6 +1044,11 @@ UNLIKELY = {
         store_turned((WIDTH, HEIGHT), 3),
         "warning",
         r"\S+/000\.png \(and 9 more\) has an EXIF orientation that would turn it, which training ignores, as .*\.",
+    ),
+    "image-colors": (
+        store_profile,
+        "warning",
+        r"\S+/000\.png \(and 9 more\) has a colour profile, which training takes for sRGB, so that viewers .*\.",
     ),
     "camera-center": (
         set_camera("PINHOLE", 40, 40, 60, 18),

@@ -14,11 +14,11 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, ImageOps, UnidentifiedImageError
 
 from sadgs_ns.cli.cameras.folder import COLMAP_FORMATS
 from sadgs_ns.cli.cameras.panoramas import VIEWS, cut, is_panorama
-from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS
+from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS, color_profile
 from sadgs_ns.errors import InputError, reason
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}  # COLMAP writes by these, and reads by content.
@@ -35,7 +35,7 @@ class Photo:
     size: tuple[int, int]  # Width and height in px, upright
     camera: tuple  # Equal for photos by one camera at one focal length, as far as size and EXIF tell
     has_alpha: bool  # Whether some pixels may be transparent
-    is_read: bool = True  # Whether COLMAP reads its format
+    is_read: bool = True  # Whether COLMAP reads its format, and its colours need no conversion
     is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
     is_panorama: bool = False
 
@@ -123,6 +123,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
         camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
         has_alpha = image.has_transparency_data
         is_read = image.format in COLMAP_FORMATS and image.mode not in ("CMYK", "LAB")  # A TIFF would stay CMYK.
+        is_read &= color_profile(image) is None
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         least = 512 if width == 2 * height else 0
         image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
@@ -166,7 +167,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
                 with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
                     kept = exif.tobytes()
                 if pixels.mode != "I;16":
-                    pixels = pixels.convert("RGBA" if photo.has_alpha else "RGB")
+                    pixels = _in_srgb(pixels, "RGBA" if photo.has_alpha else "RGB")
                 for part, target in zip(cut(pixels) if photo.is_panorama else [pixels], targets, strict=True):
                     part.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
             return
@@ -179,6 +180,17 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
         list(pool.map(convert, photos))
     partial.rename(converted)
     return converted, new
+
+
+def _in_srgb(image: Image.Image, mode: str) -> Image.Image:
+    """Convert an image to RGB or RGBA in sRGB, since training and viewers know no profiles."""
+    profile = color_profile(image)
+    if profile is None:
+        return image.convert(mode)
+    image = image if image.mode == "CMYK" else image.convert(mode)
+    with contextlib.suppress(ImageCms.PyCMSError):  # The profile is of another kind of pixels.
+        image = ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode=mode) or image
+    return image.convert(mode)
 
 
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:

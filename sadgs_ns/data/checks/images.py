@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
 from collections import Counter, defaultdict
@@ -14,7 +15,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from sadgs_ns.data import IMAGE_SUFFIXES
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
@@ -46,7 +47,17 @@ class _Image:
     mode: str = ""  # Pillow's name for the kind of pixels
     format: str = ""  # Pillow's name for the format of the file
     orientation: int = 1  # As EXIF tells it
+    has_profile: bool = False  # Whether its colours are others than sRGB's
     problem: str = ""  # The rest of a sentence that starts with the file; empty for a good image
+
+
+def color_profile(image: Image.Image) -> ImageCms.ImageCmsProfile | None:
+    """Return the profile of an image's colours if they are others than sRGB's, such as a phone's Display P3."""
+    with suppress(KeyError, OSError, ImageCms.PyCMSError):  # Most have none, and some a damaged one.
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
+        is_other = image.mode in ("RGB", "RGBA", "CMYK") and "sRGB" not in ImageCms.getProfileDescription(profile)
+        return profile if is_other else None
+    return None
 
 
 def image_size(path: Path) -> Size:
@@ -133,6 +144,9 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
         told = f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it"
         remedy = f"if the poses are those of the turned images, {_TURN}"
         yield warning(f"{told}, which training ignores, as COLMAP does: {remedy}.")
+    if other := [frame.image for frame, image in zip(frames, images, strict=True) if image.has_profile]:
+        told = f"{and_more(other[0], len(other))} has a colour profile, which training takes for sRGB, so that viewers"
+        yield warning(f"{told} show other colours: convert to sRGB, as ImageMagick's `mogrify -profile sRGB.icc` does.")
     yield note(_describe(source, images, masks))
 
 
@@ -210,7 +224,7 @@ def _inspect(path: Path) -> _Image:
             size, mode, kind, orientation = image.size, image.mode, image.format or "", 1
             with suppress(Exception):  # Damaged EXIF matters to no one. A PNG's own method would decode the image.
                 orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
-            whole = _ends_well(path, image)
+            has_profile, whole = color_profile(image) is not None, _ends_well(path, image)
         if not whole:
             with Image.open(path) as image:
                 image.load()
@@ -220,7 +234,7 @@ def _inspect(path: Path) -> _Image:
         return _Image(problem=f"is no image that Pillow knows: {again}")
     except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
         return _Image(problem=f"cannot be read as an image ({reason(error)}): {again}")
-    return _Image(size, mode, kind, orientation)
+    return _Image(size, mode, kind, orientation, has_profile)
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
