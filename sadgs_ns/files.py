@@ -18,7 +18,6 @@ def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     beside another path where the folder of `path`, which is made if there is none, must hold no other files. Raise
     WriteError if the disk is full or the folder cannot be written.
     """
-    path = Path(path)
     neighbour = path if beside is None else beside
     partial = neighbour.with_name(f".{neighbour.stem}.partial{neighbour.suffix}")
     try:

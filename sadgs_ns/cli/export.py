@@ -191,7 +191,6 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     # These import torch, which takes seconds, and `--help` and a wrong path need not wait for it.
     from torch import Tensor
 
-    from sadgs_ns.gsplat_compat import NEAR_PLANE
     from sadgs_ns.render.types import RenderOptions
     from sadgs_ns.training import checkpoints
 
@@ -216,8 +215,8 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
         raise InputError(f"{problem}: {_REMEDY}.") from error
     state = loaded.get("_extra_state")
     plan = state.get("plan", {}) if isinstance(state, dict) else {}
-    options = {"near_plane": NEAR_PLANE, "max_off_axis": _MAX_OFF_AXIS}
-    return params, RenderOptions(**{name: plan.get(name, value) for name, value in options.items()})
+    defaults = {"near_plane": RenderOptions.near_plane, "max_off_axis": _MAX_OFF_AXIS}
+    return params, RenderOptions(**{name: plan.get(name, value) for name, value in defaults.items()})
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -90,7 +90,6 @@ class PhotosToSplat:
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
         self._capture = self.source if source.is_dir() else self.source.parent
-        self._settings: dict[str, Any] = {}
         self.timeline = Timeline()
         self._exporter: Worker | None = None
         if not 0 < options.effort <= MOST_EFFORT:

@@ -48,7 +48,6 @@ def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, b
         digit = (1 << width) - 1 - index
         equal &= digits == digit
         threshold |= digit << shift
-    # Of equal priorities the first in the order of the ranks come first.
     ties = torch.where(equal, growth, 0)
     totals = world.gather(ties.sum()[None])[:, 0]
     before += int(totals[: world.rank].sum())

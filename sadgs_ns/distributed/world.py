@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cached_property
+from itertools import accumulate, pairwise
 
 import torch
 import torch.distributed as dist
@@ -150,10 +151,6 @@ class World:
 
 def _overlaps(ours: Sequence[int], theirs: Sequence[int], rank: int) -> list[int]:
     """Return how many of the rows that `rank` has by `ours` each rank has by `theirs`."""
-    start = sum(ours[:rank])
-    end = start + ours[rank]
-    overlaps, first = [], 0
-    for size in theirs:
-        overlaps.append(max(min(end, first + size) - max(start, first), 0))
-        first += size
-    return overlaps
+    start, end = sum(ours[:rank]), sum(ours[: rank + 1])
+    ranges = pairwise(accumulate(theirs, initial=0))
+    return [max(min(end, last) - max(start, first), 0) for first, last in ranges]

@@ -26,11 +26,10 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     scales, scale_extremes = _in_chunk(gaussians.scales.clip(-20, 20))
     colors, color_extremes = _in_chunk(np.float32(DEGREE_0) * gaussians.features_dc + np.float32(0.5))
     largest, others = smallest_three(gaussians.quats)
-    rotations = [_steps(value, 10) for value in (others * np.float32(np.sqrt(0.5)) + 0.5).T]
     alphas = _steps(sigmoid(gaussians.opacities), 8)
     packed = [
         _pack(means, (11, 10, 11)),
-        largest.astype("<u4") << 30 | rotations[0] << 20 | rotations[1] << 10 | rotations[2],
+        largest.astype("<u4") << 30 | _pack(others * np.float32(np.sqrt(0.5)) + 0.5, (10, 10, 10)),
         _pack(scales, (11, 10, 11)),
         _pack(colors, (8, 8, 8)) << 8 | alphas,
     ]

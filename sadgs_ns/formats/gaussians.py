@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sadgs_ns.data.coordinates import Similarity
 
 DEGREE_0 = 0.5 / np.sqrt(np.pi)  # The spherical harmonic of degree 0
-_ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that float64 takes little memory
+ROWS = 1 << 16  # Number of Gaussians that are converted at a time, so that this takes little memory
 
 Array = NDArray[np.float32]
 
@@ -71,8 +71,8 @@ class Gaussians:
         parts = {name: np.empty_like(getattr(self, name)) for name in ("means", "scales", "quats", "features_rest")}
         turn = similarity.harmonics(self.degree)[1:, 1:]
         with np.errstate(all="ignore"):
-            for start in range(0, len(self), _ROWS):
-                rows = slice(start, start + _ROWS)
+            for start in range(0, len(self), ROWS):
+                rows = slice(start, start + ROWS)
                 parts["means"][rows] = similarity.positions(self.means[rows].astype(np.float64))
                 parts["scales"][rows] = similarity.log_scales(self.scales[rows].astype(np.float64))
                 parts["quats"][rows] = similarity.rotations(self.quats[rows].astype(np.float64))

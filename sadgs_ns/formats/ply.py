@@ -6,9 +6,7 @@ from typing import IO
 
 import numpy as np
 
-from sadgs_ns.formats.gaussians import Context, Gaussians
-
-_ROWS = 1 << 16  # Gaussians that are converted at a time, so that writing takes little memory beyond their own
+from sadgs_ns.formats.gaussians import ROWS, Context, Gaussians
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
@@ -21,8 +19,8 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns", f"element vertex {len(gaussians)}"]
     file.write("\n".join([*lines, *(f"property float {name}" for name in names), "end_header\n"]).encode())
-    for start in range(0, len(gaussians), _ROWS):
-        part = gaussians[start : start + _ROWS]
+    for start in range(0, len(gaussians), ROWS):
+        part = gaussians[start : start + ROWS]
         rest = part.features_rest.transpose(0, 2, 1).reshape(len(part), -1)  # The file has colour before band.
         columns = [part.means, np.zeros_like(part.means), part.features_dc, rest, part.opacities[:, None]]
         file.write(np.concatenate([*columns, part.scales, part.quats], axis=1).astype("<f4").tobytes())

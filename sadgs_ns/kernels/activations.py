@@ -29,10 +29,7 @@ def _activate(log_scales, logits, scales, opacities, sums, n, penalty, LANES: tl
     tl.store(sums + program, penalty * tl.sum(tl.where(g < size, opacity, 0.0)))
 
 
-@triton.jit(
-    do_not_specialize=["n", "row"],
-    do_not_specialize_on_alignment=["v_scales", "v_opacities", "v_penalty"],
-)
+@triton.jit(do_not_specialize=["n", "row"], do_not_specialize_on_alignment=["v_scales", "v_opacities", "v_penalty"])
 def _activate_backward(
     scales, opacities, v_scales, v_opacities, v_penalty, v_log_scales, v_logits, n, row, penalty,
     PENALTY: tl.constexpr, LANES: tl.constexpr,

@@ -33,16 +33,14 @@ def _update(
     """
     block = tl.program_id(0).to(tl.int64)
     n = rows.to(tl.int64) * WIDTHS[0]
-    parameter, gradient, mean, square, rate, scale = (
-        parameters[0], gradients[0], means[0], squares[0], rates[0], scales[0]
-    )  # fmt: skip
+    parameter, gradient, rate = parameters[0], gradients[0], rates[0]
+    mean, square, scale = means[0], squares[0], scales[0]
     for k in tl.static_range(1, len(WIDTHS)):
         if block * BLOCK >= n:  # the block belongs to a later parameter
             block -= tl.cdiv(n, BLOCK)
             n = rows.to(tl.int64) * WIDTHS[k]
-            parameter, gradient, mean, square, rate, scale = (
-                parameters[k], gradients[k], means[k], squares[k], rates[k], scales[k]
-            )  # fmt: skip
+            parameter, gradient, rate = parameters[k], gradients[k], rates[k]
+            mean, square, scale = means[k], squares[k], scales[k]
     drawn = FLAGS == 0
     for k in tl.static_range(FLAGS):
         drawn = drawn | (tl.load(overflowed[k]) == 0)

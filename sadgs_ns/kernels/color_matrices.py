@@ -35,9 +35,7 @@ def _correct(render, alpha, matrices, corrected, n, LANES: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["n"])
-def _correct_backward(
-    render, alpha, matrices, v_corrected, v_render, v_alpha, sums, n, LANES: tl.constexpr
-):  # fmt: skip
+def _correct_backward(render, alpha, matrices, v_corrected, v_render, v_alpha, sums, n, LANES: tl.constexpr):
     """Write the gradients by colours and opacities of one view's pixels, and sum those by its matrix in parts."""
     view = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * LANES + tl.arange(0, LANES)

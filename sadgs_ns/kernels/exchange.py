@@ -61,8 +61,7 @@ def pack(
     rows = means2d.new_empty((len(places), 10 + per_gaussian))
     if len(places):
         _pack[cdiv(len(places), _ROWS),](
-            places, means2d, conics, opacities, colors, depths, radii, rows, len(places),
-            per_gaussian, _ROWS, _COLUMNS,
+            places, means2d, conics, opacities, colors, depths, radii, rows, len(places), per_gaussian, _ROWS, _COLUMNS
         )  # fmt: skip
     return rows
 

@@ -114,8 +114,7 @@ def _add(sums, basis, v):
 
 # The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
 @triton.jit(
-    do_not_specialize=["n", "start", "num_views", "used", "stride", "row"],
-    do_not_specialize_on_alignment=["v_colors"],
+    do_not_specialize=["n", "start", "num_views", "used", "stride", "row"], do_not_specialize_on_alignment=["v_colors"]
 )
 def _backward(
     means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride, row,
@@ -172,9 +171,7 @@ class _Colors(torch.autograd.Function):
         num_views, n = radii.shape[:2]
         colors = means.new_empty((num_views, n, 3))
         grid = (cdiv(n, _LANES), num_views)
-        _forward[grid](
-            means, viewmats, first, rest, radii, colors, n, used, rest.shape[1] * 3, radii.dim() - 1, _LANES
-        )  # fmt: skip
+        _forward[grid](means, viewmats, first, rest, radii, colors, n, used, rest.shape[1] * 3, radii.dim() - 1, _LANES)
         ctx.save_for_backward(means, rest, viewmats, radii, colors)
         ctx.used = used
         return colors

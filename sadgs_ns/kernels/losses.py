@@ -217,9 +217,7 @@ class _PhotometricLoss(torch.autograd.Function):
         spread, gradient = torch.empty_like(slopes), torch.empty_like(x)
         tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
         _spread_along_rows[cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
-        _gradient[tiles](
-            x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS
-        )  # fmt: skip
+        _gradient[tiles](x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS)
         return gradient, *[None] * 4, upstream.expand(ctx.num_parts) if ctx.num_parts else None
 
 

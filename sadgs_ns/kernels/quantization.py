@@ -22,9 +22,8 @@ def _to_byte(value, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
 
 @triton.jit(do_not_specialize=["n"])
 def _quantize(
-    tensor, quantized, n,
-    HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PIXELS: tl.constexpr,
-):  # fmt: skip
+    tensor, quantized, n, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PIXELS: tl.constexpr
+):
     pixel = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
     exists = pixel < n
     xx, xy, yy = load3(tensor, 3 * pixel, exists)

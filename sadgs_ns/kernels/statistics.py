@@ -54,8 +54,7 @@ def _frequency(byte, HIGHEST: tl.constexpr, OCTAVES: tl.constexpr):
 
 # One view's intrinsics and S̄ may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
 @triton.jit(
-    do_not_specialize=["n", "num_views", "width", "height"],
-    do_not_specialize_on_alignment=["structure_tensors", "Ks"],
+    do_not_specialize=["n", "num_views", "width", "height"], do_not_specialize_on_alignment=["structure_tensors", "Ks"]
 )
 def _observe(
     means, quats, scales, radii, means2d, conics, jitter, structure_tensors, viewmats, Ks,

@@ -19,9 +19,8 @@ _PIXELS = 1024  # Pixels that a program handles where no neighbours matter
 
 @triton.jit(do_not_specialize=["height", "width", "taps"])
 def _correlate(
-    image, kernel, result, height, width, taps,
-    VERTICAL: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
-):  # fmt: skip
+    image, kernel, result, height, width, taps, VERTICAL: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+):
     row = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     inside = (row < height) & (column < width)
@@ -108,9 +107,8 @@ def differentiate(
     products, energy = (blurs[0].new_empty((batch, planes, height, width)) for planes in (3, 1))
     n = height * width
     _differentiate[cdiv(n, _PIXELS), batch](
-        *blurs, *totals, weight, previous, products, energy,
-        n, channels, n * (len(weight) > 1), _PIXELS,
-    )  # fmt: skip
+        *blurs, *totals, weight, previous, products, energy, n, channels, n * (len(weight) > 1), _PIXELS
+    )
     return blurs[0], products, energy
 
 

@@ -59,9 +59,7 @@ class Visibility:
 
 
 def measure_visibility(
-    params: Mapping[str, Tensor],
-    cameras: Iterable[tuple[Tensor, Tensor, int, int]],
-    drawing: RenderOptions = DEFAULTS,
+    params: Mapping[str, Tensor], cameras: Iterable[tuple[Tensor, Tensor, int, int]], drawing: RenderOptions = DEFAULTS
 ) -> Visibility:
     """Measure how many pixels Gaussians make up in training views: opacity × area, less the part that others hide.
 

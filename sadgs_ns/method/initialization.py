@@ -29,12 +29,11 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
     if (low == high).all():
         return points[:0], 1.0
     ticks = (torch.arange(grid, device=points.device, dtype=points.dtype) + 0.5) / grid  # cell centres in (0, 1)
-    u, v = torch.meshgrid(ticks, ticks, indexing="ij")
+    square = torch.cartesian_prod(ticks, ticks)  # [grid², 2]
     faces = []
     for axis in range(3):
         for side in (0.0, 1.0):
-            face = torch.stack([u, v], -1).reshape(-1, 2)
-            face = torch.cat([face[:, :axis], torch.full_like(face[:, :1], side), face[:, axis:]], dim=1)
+            face = torch.cat([square[:, :axis], torch.full_like(square[:, :1], side), square[:, axis:]], dim=1)
             faces.append(low + face * (high - low))
     placed = torch.cat(faces)
     if (low == high).any():
@@ -58,14 +57,9 @@ def neighbour_scales(points: Tensor) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
-def plausible_points(points: Tensor) -> Tensor:
-    """Tell which SfM points [P, 3] to start from: all that are finite and not absurdly far out. bool [P]"""
-    return ~_far_outliers(points, POINT_SHARE)
-
-
-def _far_outliers(positions: Tensor, share: float) -> Tensor:
-    """`outliers.far_outliers` of a tensor. [P, 3] → bool [P]"""
-    return torch.from_numpy(far_outliers(positions.detach().cpu().numpy(), share)).to(positions.device)
+def plausible_points(points: Tensor, share: float = POINT_SHARE) -> Tensor:
+    """Tell which SfM points, or cameras, count: all but `outliers.far_outliers` with this share. [P, 3] → bool [P]"""
+    return ~torch.from_numpy(far_outliers(points.detach().cpu().numpy(), share)).to(points.device)
 
 
 def starting_points(
@@ -97,6 +91,6 @@ def camera_extent(positions: Tensor) -> float:
 
     Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count. It is 1 where all coincide.
     """
-    positions = positions[~_far_outliers(positions, CAMERA_SHARE)]
+    positions = positions[plausible_points(positions, CAMERA_SHARE)]
     extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())
     return extent if extent > 0 else 1.0

@@ -85,8 +85,7 @@ def photometric_part(
     SSIM's windows belong to the rows in which they are centred. Raises ValueError as `photometric_loss`.
 
     Args:
-        predicted: Rendered rows, from `top` on. Unless the image's border is there, 5 more than `rows` on either side.
-            [1, H', W, 3]
+        predicted: Rendered rows from `top` on, 5 more than `rows` on either side but at image borders. [1, H', W, 3]
         target: The same rows of the training view.
         rows: First row that counts and one past the last.
         top: Which row of the view is the first of `predicted`.

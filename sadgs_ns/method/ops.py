@@ -24,7 +24,7 @@ def opacities(params: Params) -> Tensor:
 
 @torch.no_grad()
 def update_param_with_optimizer(
-    param_fn: Callable[[str, Tensor], torch.nn.Parameter],
+    param_fn: Callable[[str, Tensor], Tensor],
     optimizer_fn: Callable[[str, Tensor], Tensor],
     params: Params,
     optimizers: Optimizers,
@@ -33,7 +33,7 @@ def update_param_with_optimizer(
     """Replace parameters and their optimizers' moments, as gsplat's `duplicate` and `split` do.
 
     Args:
-        param_fn: Makes the new parameter from its name and the old one.
+        param_fn: Makes the new parameter's values from its name and the old one.
         optimizer_fn: Makes a new moment from its key and the old one; `step` stays.
         names: The parameters to change; None changes all.
     """
@@ -43,7 +43,7 @@ def update_param_with_optimizer(
         for key, value in state.items():
             if key != "step":
                 state[key] = optimizer_fn(key, value)
-        params[name] = new = param_fn(name, old)
+        params[name] = new = torch.nn.Parameter(param_fn(name, old), requires_grad=old.requires_grad)
         if optimizer is not None:
             optimizer.param_groups[0]["params"], optimizer.state[new] = [new], state
 
@@ -51,11 +51,10 @@ def update_param_with_optimizer(
 def map_opacities(function: Callable[[Tensor], Tensor], params: Params, optimizers: Optimizers) -> None:
     """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
 
-    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
-        changed = torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
-        return torch.nn.Parameter(changed, requires_grad=p.requires_grad)
+    def changed(name: str, p: Tensor) -> Tensor:
+        return torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
 
-    update_param_with_optimizer(param_fn, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
+    update_param_with_optimizer(changed, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
 
 
 def rebalance(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
@@ -63,11 +62,9 @@ def rebalance(world: World, params: Params, optimizers: Optimizers, state: State
     world.count(len(params["means"]))
     if not world.is_uneven():
         return
-
-    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
-        return torch.nn.Parameter(world.rebalance(p.detach()), requires_grad=p.requires_grad)
-
-    update_param_with_optimizer(param_fn, lambda key, v: world.rebalance(v), params, optimizers)
+    update_param_with_optimizer(
+        lambda name, p: world.rebalance(p.detach()), lambda key, v: world.rebalance(v), params, optimizers
+    )
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = world.rebalance(value)

@@ -19,10 +19,8 @@ class RunningMean:
     """
 
     def __init__(self) -> None:
-        self.count = 0
-        """Number of iterations in the mean."""
-        self.means: dict[str, Tensor] = {}
-        """Means by the parameters' names, of the parameters' shapes."""
+        self.count = 0  # Number of iterations in the mean
+        self.means: dict[str, Tensor] = {}  # Means by the parameters' names, of the parameters' shapes
 
     @torch.no_grad()
     def add(self, params: Params) -> None:

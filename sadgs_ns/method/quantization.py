@@ -12,9 +12,7 @@ HIGHEST_FREQUENCY = 4.0  # 1/px. S̄'s trace is at most c²/px², so this is the
 OCTAVES = 12.0  # Frequencies from 2⁻¹² of the highest one on, so wavelengths of 0.25 to 1,024 px, are told apart.
 
 
-def quantize(
-    tensor: Tensor,  # [..., 3]
-) -> Tensor:
+def quantize(tensor: Tensor) -> Tensor:
     """Round √xx and √yy on a logarithmic scale, and the correlation xy / √(xx yy) on a linear one, to a byte each.
 
     A logarithm keeps the relative error of every wavelength the same (at most 1.7 %), and a correlation within ±1 keeps

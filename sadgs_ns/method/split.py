@@ -86,7 +86,7 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
     shrink = torch.where(is_axis_split, (n / child_scale).log(), 0.0)  # [Q, 3]
     log_share = -math.log(child_scale) * is_axis_split.sum(dim=1).to(n.dtype)  # [Q]
 
-    def param_fn(name: str, p: Tensor) -> torch.nn.Parameter:
+    def param_fn(name: str, p: Tensor) -> Tensor:
         children = p[parents]
         if name == "means":
             children = children + offsets
@@ -96,7 +96,7 @@ def grid_split(params: Params, optimizers: Optimizers, state: State, counts: Ten
             log_q = log_share.view(-1, *[1] * (children.dim() - 1))
             # logit(q σ(x)) without overflow or cancellation; x itself where q is 1.
             children = log_q - torch.logaddexp(torch.log(-torch.expm1(log_q)), -children)
-        return torch.nn.Parameter(torch.cat([p[rest], children]), requires_grad=p.requires_grad)
+        return torch.cat([p[rest], children])
 
     def with_empty_children(key: str, v: Tensor) -> Tensor:
         return torch.cat([v[rest], v.new_zeros((len(parents), *v.shape[1:]))])

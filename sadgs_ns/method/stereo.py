@@ -81,8 +81,7 @@ def depth_maps(
             RGB is multiplied by alpha; pixels with an alpha under 0.5 are masked. [H, W, 3 or 4]
         viewmats, Ks: As `render.types.Cameras`, of the images; the centre of the first pixel is (0.5, 0.5).
         points: Points on surfaces, in world units, which tell what the views see, and how far away it is. [P, 3]
-        masks: Valid pixels of each view, or None for all. Others get no depth, and nothing is compared with them.
-            Each bool [H, W]
+        masks: Valid pixels of each view, or None for all; others get no depth, and are not compared. Each bool [H, W]
         device: Where to compute. The results lie there.
 
     Returns:
@@ -196,8 +195,7 @@ def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Te
         near = [n for n in neighbours[v] if n >= 0]
         to, back = projections[near] @ inverses[v], projections[v] @ inverses[near]  # [N, 4, 4]
         to, back = (matrices[:, :3].to(points.device, torch.float32) for matrices in (to, back))
-        # Surfaces without points may lie nearer and farther.
-        inverse = 0.5 / ranges[v][1], 1.5 / ranges[v][0]
+        inverse = 0.5 / ranges[v][1], 1.5 / ranges[v][0]  # Surfaces without points may lie nearer and farther.
         motions = Ks[near, 0, 0] * (centres[near] - centres[v]).norm(dim=1)  # px per inverse depth. [N]
         views.append(_View(levels, near, to, back, inverse, 1 / max(motions.tolist(), default=1.0)))
     return views

@@ -23,7 +23,6 @@ from sadgs_ns.method.statistics import consistent, empty_statistics, observe
 
 Info = Mapping[str, Any]
 Infos = Info | Sequence[Info]  # gsplat's info of the views of a step, or a list with one for each image size
-_WINDOWS = tuple(field.name for field in fields(Windows))
 
 TAU_PRUNE = 0.8  # τ_prune: share of observations that must be low on every axis to prune a faint Gaussian (section 3.4)
 PRUNE_OPACITY = 0.1  # τ_α: opacity under which a Gaussian with consistently low η is pruned (paper, section 3.4)
@@ -105,7 +104,7 @@ class StructureAwareStrategy(Strategy):
 
     @property
     def _given(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in _WINDOWS}
+        return {field.name: getattr(self, field.name) for field in fields(Windows)}
 
     def check(self) -> None:
         """Raise ValueError if an option is out of its range."""
@@ -254,8 +253,7 @@ class StructureAwareStrategy(Strategy):
             )
         apply(proposal, allowed, params, optimizers, state)
         if by_eta:
-            # The statistics of parents say nothing about their children.
-            self._clear_statistics(params, state)
+            self._clear_statistics(params, state)  # Those of parents say nothing about their children.
             names = ("before", "violating", "low", "split", "pruned", "after")
             of_this = (n_before, int((growth > 0).sum()), n_low, int(allowed.sum()), n_pruned, len(params["means"]))
             numbers = dict(zip(names, self.world.sums(*of_this), strict=True))

@@ -77,10 +77,8 @@ def multiscale_structure_tensor(
     `epsilon` is given. Channels are summed after Di Zenzo. I_{−1} is the unsmoothed image.
 
     Args:
-        images: Linear in the pixel value, any non-negative range, any floating dtype (computed in at least float32).
-            [B, H, W, C]
-        masks: Valid pixels; the others, which may hold anything, NaN too, neither contribute nor receive a tensor.
-            bool [B, H, W] or None for all.
+        images: Linear in pixel values, any range ≥ 0, any floating dtype (computed in at least float32). [B, H, W, C]
+        masks: Valid pixels, or None for all; others, even NaN, neither contribute nor receive a tensor. bool [B, H, W]
         frequency_constant: See FREQUENCY_CONSTANT; `noise_floor` and `energy_blur` have constants, too.
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.

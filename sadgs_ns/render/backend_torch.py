@@ -17,15 +17,10 @@ from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
 TILE_SIZE = 16  # Size of tiles in px
 
-# These are the constants of gsplat's compositing.
-_MAX_ALPHA, _MIN_ALPHA, _MIN_TRANSMITTANCE = 0.999, 1.0 / 255.0, 1e-4
-# exp(-sigma) is invisible long before this. Beyond 87 it would be subnormal, which is many times slower to compute.
-_MAX_SIGMA = 60.0
-
-# This many (pixel, Gaussian) pairs are held at a time, in ten temporaries, unless a segment of one tile has more.
-_CHUNK_PAIRS = 1 << 18
-# Tile lists are composited in segments of at most this many Gaussians, so that opaque tiles can stop early.
-_SEGMENT = 128
+_MAX_ALPHA, _MIN_ALPHA, _MIN_TRANSMITTANCE = 0.999, 1.0 / 255.0, 1e-4  # The constants of gsplat's compositing
+_MAX_SIGMA = 60.0  # exp(-sigma) is invisible long before; beyond 87 it would be subnormal, many times slower to compute
+_CHUNK_PAIRS = 1 << 18  # Pairs of a pixel and a Gaussian held at a time in ten temporaries, unless a segment has more
+_SEGMENT = 128  # Most Gaussians of a tile's list that are composited at once, so that opaque tiles can stop early
 
 
 class _Tiles(NamedTuple):
@@ -98,9 +93,8 @@ def _project(
     means2d, covars2d = perspective(means_c, covars_c, Ks, width, height)
     # Gaussians of billions of px, whose determinant overflows, have no inverse and are culled, too.
     valid = valid & _determinant(covars2d.detach()).isfinite()
-    covars2d = torch.where(valid[..., None, None], covars2d, torch.eye(2, dtype=means.dtype, device=means.device))
-
-    covars2d = covars2d + SCREEN_BLUR * torch.eye(2, dtype=means.dtype, device=means.device)
+    identity = torch.eye(2, dtype=means.dtype, device=means.device)
+    covars2d = torch.where(valid[..., None, None], covars2d, identity) + SCREEN_BLUR * identity
     det = _determinant(covars2d)
     valid = valid & (det > 0)
     det = torch.where(valid, det, 1.0)
@@ -150,7 +144,6 @@ def _bin_into_tiles(
     low = (centers - reach).floor().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)  # [C, N, 2]
     high = (centers + reach).ceil().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)
     spans = (high - low) * visible[..., None]
-
     counts = spans.prod(dim=-1).flatten()
     flatten_ids = torch.repeat_interleave(counts)  # [n_isects]
     nth = torch.arange(len(flatten_ids), device=device) - (counts.cumsum(0) - counts)[flatten_ids]
@@ -163,7 +156,6 @@ def _bin_into_tiles(
     depth_bits = depths.flatten().float().view(torch.int32).long()[flatten_ids]
     keys = (camera_ids << (32 + n_tiles.bit_length())) | (tile_ids << 32) | depth_bits
     flatten_ids = flatten_ids[keys.argsort(stable=True)]
-
     per_tile = torch.bincount(camera_ids * n_tiles + tile_ids, minlength=C * n_tiles)  # [T]
     tops, lefts = (TILE_SIZE * torch.arange(count, device=device) for count in (tile_height, tile_width))
     origins = torch.cartesian_prod(tops, lefts).flip(1).repeat(C, 1)
@@ -257,7 +249,6 @@ def _segment(
     x, y = means2d.reshape(-1, 2)[ids].unbind(-1)  # [B, L]
     a, b, c = conics.reshape(-1, 3)[ids][:, None, None].unbind(-1)  # [B, 1, 1, L]
     opacity = opacities.reshape(-1)[ids] * (positions < counts)
-
     centers = torch.arange(tiles.size, dtype=x.dtype, device=x.device) + 0.5
     pixels = tiles.origins[chunk, :, None] + centers  # [B, 2, S]
     dx = x[:, None, None] - pixels[:, 0, None, :, None]
@@ -266,7 +257,6 @@ def _segment(
     negative = sigmas < 0
     alphas = sigmas.clamp_max_(_MAX_SIGMA).neg_().exp_().mul_(opacity[:, None, None]).clamp_max_(_MAX_ALPHA)
     alphas.masked_fill_(negative.logical_or_(alphas < _MIN_ALPHA), 0.0)
-
     transmittances = torch.cat([start[..., None], 1.0 - alphas], dim=-1).cumprod(dim=-1)
     # The Gaussian that would leave too little transmittance, and all behind it, are not drawn.
     weights = (alphas * transmittances[..., :-1]).masked_fill_(transmittances[..., 1:] <= _MIN_TRANSMITTANCE, 0.0)
@@ -291,7 +281,6 @@ def _segment_gradients(
     )
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
-
     # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
     columns, rows = v_sigmas.sum(dim=1, keepdim=True), v_sigmas.sum(dim=2, keepdim=True)  # [B, 1, S, L], [B, S, 1, L]
     mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]

@@ -108,10 +108,7 @@ def find_kernels() -> None:
     torch.set_num_threads(1)
     stages = Stages(KernelChoice(torch.device("cpu")))
     with triton_switched(True):
-        for stage in stages.alone().values():
-            stage()
-        stages.project()
-        for stage in stages.after_projection().values():
+        for stage in (*stages.alone().values(), stages.project, *stages.after_projection().values()):
             stage()
         Stages(KernelChoice(torch.device("cpu"), size=(4096, 4096))).tile_lists()  # More tiles have longer numbers.
 

@@ -161,8 +161,7 @@ class GraphedSteps:
         observes = group.structure_tensors is not None
         if self.failure or len(groups) > 1 or not plain or not known or observes or strategy.densifies(step):
             return None
-        found = self._graph(group, opacity_reg, update, factors)
-        if found is None:
+        if (found := self._graph(group, opacity_reg, update, factors)) is None:
             return None
         replay, inputs = found
         inputs.write(group, factors)

@@ -75,7 +75,7 @@ def import_nerfstudio() -> None:
     try:
         for importer, names in DEFERRED.items():
             StandIn.importing = bool(names)  # Other packages may need what they ask for.
-            true = {name: sys.modules.get(name) for name in names}
+            true = {name: sys.modules[name] for name in names if name in sys.modules}
             for name in names:
                 sys.modules[name] = stand_in = StandIn(name, lambda name=name: import_module(name))
                 parent, _, child = name.rpartition(".")
@@ -84,10 +84,8 @@ def import_nerfstudio() -> None:
             try:
                 import_module(importer)
             finally:
-                for name, module in true.items():
-                    if module is None:
-                        del sys.modules[name]
-                    else:
-                        sys.modules[name] = module
+                for name in names:
+                    del sys.modules[name]
+                sys.modules.update(true)
     finally:
         StandIn.importing = False

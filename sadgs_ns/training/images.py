@@ -81,8 +81,7 @@ class LazyImages(Sequence[dict[str, Any]]):
             raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
         if undistort is not None:
             _, undistorted, mask = undistort(data, image.numpy())
-            # nerfstudio's crop is a view of the larger image.
-            image = torch.from_numpy(np.ascontiguousarray(undistorted))
+            image = torch.from_numpy(np.ascontiguousarray(undistorted))  # The crop is a view of the larger image.
             if mask is not None:
                 data["mask"] = mask.contiguous()
         return {**data, "image": image}

@@ -40,9 +40,8 @@ def training_size(datamanager: FullImageDatamanager, views: int, processes: int 
     """Measure a run with this many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
-    structure = 0.0
     if datamanager.config.cache_images == "gpu":
-        kept = image_bytes(datamanager)
+        kept, structure = image_bytes(datamanager), 0.0
     else:  # The images of the next step are there, too. A process has those that it composites, and S̄ of all.
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
         here = views  # A process may have a part of each view if there are several sizes.

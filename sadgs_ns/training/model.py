@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, replace
-from functools import lru_cache
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -50,8 +50,6 @@ class SadgsModel(SplatfactoModel):
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
     every_view_id: Tensor
-    near_plane: float
-    plan: RunPlan
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
@@ -304,10 +302,10 @@ class SadgsModel(SplatfactoModel):
         image = image.to(self.device)
         return image / 255.0 if image.dtype == torch.uint8 else image
 
-    @property
+    @cached_property
     def background(self) -> Tensor:
         """Colour behind the Gaussians; it is made once. [3]"""
-        return _constant_color(float(self.config.background_color == "white"), self.device)
+        return torch.full((3,), float(self.config.background_color == "white"), device=self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images in [0, 1] [..., H, W, 3 or 4] on the background, [3] or [H, W, 3], if they have alpha."""
@@ -340,10 +338,7 @@ class SadgsModel(SplatfactoModel):
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return PSNR in dB of images in [0, 1], [1, 3, H, W] or [H, W, 3]."""
-        # The import takes a second, and training does not need it.
-        from torchmetrics.functional.image import peak_signal_noise_ratio
-
-        return peak_signal_noise_ratio(predicted, target, data_range=1.0)
+        return -10 * (predicted - target).square().mean().log10()
 
     def lpips(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return LPIPS (AlexNet) of images [1, 3, H, W] in [0, 1], or NaN if its weights cannot be loaded."""
@@ -385,11 +380,6 @@ class SadgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
-
-
-@lru_cache(maxsize=8)
-def _constant_color(grey: float, device: torch.device) -> Tensor:
-    return torch.full((3,), grey, device=device)
 
 
 def load_lpips(device: torch.device) -> torch.nn.Module | None:

@@ -44,6 +44,7 @@ class SadgsPipeline(VanillaPipeline):
 
     config: SadgsPipelineConfig
     datamanager: SadgsDatamanager
+    model: SadgsModel  # nerfstudio's property; the model is never wrapped for several devices
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         config.check()
@@ -81,11 +82,6 @@ class SadgsPipeline(VanillaPipeline):
         shown = shows_output(self.structure.viewer, NORMALS)
         normals = {NORMALS: self.model.get_normals(camera) if shown else rendered["rgb"]}
         return normals | self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
-
-    @property
-    def model(self) -> SadgsModel:
-        """The model, which is never wrapped for several devices."""
-        return self._model  # type: ignore[return-value]
 
     def follow(self, plan: RunPlan) -> None:
         """From now on, train and draw according to a plan."""

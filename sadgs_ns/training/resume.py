@@ -12,7 +12,6 @@ import torch
 from nerfstudio.engine.optimizers import Optimizers
 from scipy.spatial import KDTree
 from torch import Tensor
-from torch.cuda.amp.grad_scaler import GradScaler
 
 from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.distributed.world import World
@@ -52,9 +51,8 @@ class Resumption:
     def plan(self) -> RunPlan | None:
         """The plan of the run that wrote it; None if that was another method's, which `load_gaussians` refuses."""
         with self._errors_name_file():
-            pipeline = self.state["pipeline"]
-            state = pipeline.get("_extra_state") if isinstance(pipeline, dict) else None
-            return RunPlan.of(state["plan"]) if isinstance(state, dict) and "plan" in state else None
+            state = self.state["pipeline"].get("_extra_state")
+            return None if state is None else RunPlan.of(state["plan"])
 
     def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
         """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
@@ -69,13 +67,12 @@ class Resumption:
                 remedy = "set pipeline.model.color-model and pipeline.model.camera-optimizer.mode as they were"
                 raise InputError(f"It optimized {' and '.join(more)}, too: {remedy}.")
 
-    def load_optimizers(self, optimizers: Optimizers, scaler: GradScaler, schedulers: bool) -> None:
+    def load_optimizers(self, optimizers: Optimizers, schedulers: bool) -> None:
         """Load the optimizers and, if asked for, their schedulers, and print where the run goes on."""
         with self._errors_name_file():
             optimizers.load_optimizers(self.state["optimizers"])
             if "schedulers" in self.state and schedulers:
                 optimizers.load_schedulers(self.state["schedulers"])
-            scaler.load_state_dict(self.state["scalers"])
         note(f"Resuming after step {self.state['step']} of {self.path}")
 
 

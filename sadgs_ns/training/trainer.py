@@ -120,7 +120,7 @@ class SadgsTrainer(Trainer):
         """Load the checkpoint's optimizers; `setup_optimizers` has loaded its Gaussians."""
         if self._resumed is None:
             return super()._load_checkpoint()
-        self._resumed.load_optimizers(self.optimizers, self.grad_scaler, self.config.load_scheduler)
+        self._resumed.load_optimizers(self.optimizers, self.config.load_scheduler)
         self._resumed = None
 
     def setup_optimizers(self) -> SadgsOptimizers:

@@ -30,8 +30,7 @@ class ViewSampler:
     def __init__(self, num_views: int, seed: int) -> None:
         self.num_views = num_views
         self._generator = random.Random(seed)
-        self._order: list[int] = []
-        """Views to come; another round is appended when a step needs it."""
+        self._order: list[int] = []  # Views to come; another round is appended when a step needs it
 
     def draw(self, number: int) -> list[int]:
         """Return the indices of the next step's views."""

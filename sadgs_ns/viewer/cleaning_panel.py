@@ -12,7 +12,6 @@ from torch import Tensor
 
 from sadgs_ns.errors import reason
 from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
-from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
@@ -47,11 +46,6 @@ class CleaningPanel(torch.nn.Module):
         return ViewerSlider(name, type(most)(0), type(most)(0), most, step, cb_hook=self._changed, hint=hint)
 
     @property
-    def _model(self) -> SadgsModel:
-        """The model; with a public name, the viewer would find its elements twice."""
-        return self._views.model
-
-    @property
     def cleaning(self) -> Cleaning:
         """The elements' values; raises InputError if the box is reversed."""
         low, high = self.crop_from.value, self.crop_to.value
@@ -70,12 +64,11 @@ class CleaningPanel(torch.nn.Module):
 
     def refresh(self) -> None:
         """Find which Gaussians stay, and show how many; raises InputError if the box is reversed."""
-        cleaning, model = self.cleaning, self._model
+        cleaning, views, model = self.cleaning, self._views, self._views.model
         params = dict(model.gauss_params.items())
         now = (model.num_points, model.step)  # Training outdates what was seen.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
-            views = self._views
             poses = [(views.viewmat(i).detach(), views.cameras[1][i], w, h) for i, (h, w) in enumerate(views.sizes)]
             self._seen = now, measure_visibility(params, poses, model.drawing)
         stays, sentences = find_remaining(params, cleaning, None if self._seen is None else self._seen[1])
@@ -91,7 +84,7 @@ class CleaningPanel(torch.nn.Module):
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return `cleaned` [H, W, 3] in [0, 1]; it is `rgb` once densification changed the Gaussians."""
-        model, stays = self._model, self._stays
+        model, stays = self._views.model, self._stays
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
         box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays

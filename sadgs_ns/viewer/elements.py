@@ -26,13 +26,10 @@ class ViewerMarkdown(ViewerElement[str]):
         self.text = text
         self._shown = ""
 
-    def _create_gui_handle(self, viser_server: ViserServer) -> None:
+    def install(self, viser_server: ViserServer) -> None:
         self._shown = self.text()
         # Without a root, viser warns of images that come with the text.
         self.gui_handle: Any = viser_server.gui.add_markdown(self._shown, image_root=Path())
-
-    def install(self, viser_server: ViserServer) -> None:
-        self._create_gui_handle(viser_server)
 
     def refresh(self) -> None:
         """Send the text to the viewer, if there is one, when it has changed."""
@@ -42,8 +39,7 @@ class ViewerMarkdown(ViewerElement[str]):
 
 def show_output(control: ViewerControl, name: str) -> None:
     """Have the viewer, if there is one, show one of its output types, if it knows that type already."""
-    viewer = getattr(control, "viewer", None)  # set when the viewer is made
-    if viewer is not None:
+    if (viewer := getattr(control, "viewer", None)) is not None:  # set when the viewer is made
         output = viewer.control_panel._output_render  # nerfstudio 1.1 has no public way.
         if name in output.options:
             output.value = name
@@ -51,8 +47,7 @@ def show_output(control: ViewerControl, name: str) -> None:
 
 def shows_output(control: ViewerControl, name: str) -> bool:
     """Tell whether the viewer shows one of its output types, in the whole window or in half of it."""
-    viewer = getattr(control, "viewer", None)
-    if viewer is None:
+    if (viewer := getattr(control, "viewer", None)) is None:
         return False
     panel = viewer.control_panel
     return name == panel.output_render or (panel.split and name == panel.split_output_render)

@@ -30,12 +30,9 @@ MIN_COVER = 0.05  # Share of a pixel that Gaussians with a value must make up; o
 
 @torch.no_grad()
 def blend(
-    params: Mapping[str, Tensor],
-    values: Tensor,  # [N, D]
-    camera: Cameras,
-    drawing: RenderOptions = DEFAULTS,
+    params: Mapping[str, Tensor], values: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> tuple[Tensor, Tensor]:
-    """Blend D values of each Gaussian like colours. → [H, W, D], and the covered share of each pixel [H, W, 1]"""
+    """Blend values [N, D] of the Gaussians like colours. → [H, W, D], and the covered share of each pixel [H, W, 1]"""
     opacities = torch.sigmoid(params["opacities"].flatten())
     gaussians = Gaussians(params["means"], params["quats"], params["scales"].exp(), opacities, values)
     render, alpha, _ = rasterize(gaussians, camera, drawing)
@@ -43,15 +40,12 @@ def blend(
 
 
 def mean_map(
-    params: Mapping[str, Tensor],
-    values: Tensor,  # [N]
-    camera: Cameras,
-    drawing: RenderOptions = DEFAULTS,
-    known: Tensor | None = None,  # Which Gaussians have a value; None is all. bool [N]
+    params: Mapping[str, Tensor], values: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
-    """Return the mean value of what is drawn at each pixel. [H, W]"""
-    weights = torch.ones_like(values) if known is None else known.float()
-    total, cover = blend(params, torch.stack([weights * values, weights], dim=-1), camera, drawing)[0].unbind(-1)
+    """Return the mean of the values [N], where NaN is none, of what is drawn at each pixel. [H, W]"""
+    weights = (~values.isnan()).to(values)
+    layers = torch.stack([values.nan_to_num(0.0), weights], dim=-1)
+    total, cover = blend(params, layers, camera, drawing)[0].unbind(-1)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)
 
 
@@ -61,7 +55,7 @@ def eta_map(
     """Return the geometric mean of the largest η of the Gaussians observed (`eta_max`, `n_total`). [H, W]"""
     largest = statistics["eta_max"].amax(dim=1)
     known = (statistics["n_total"] > 0) & (largest > 0)
-    return mean_map(params, torch.where(known, largest, 1.0).log(), camera, drawing, known).exp()
+    return mean_map(params, torch.where(known, largest, torch.nan).log(), camera, drawing).exp()
 
 
 def children_map(

@@ -9,21 +9,13 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.viewer.viewer_elements import (
-    ViewerButton,
-    ViewerControl,
-    ViewerDropdown,
-    ViewerNumber,
-    ViewerParameter,
-    ViewerSlider,
-)
+from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerControl, ViewerDropdown, ViewerNumber, ViewerSlider
 from torch import Tensor
 
 from sadgs_ns.errors import reason
@@ -100,13 +92,10 @@ class StructurePanel(torch.nn.Module):
         self.choice = ViewerDropdown("Show", OFF, CHOICES, cb_hook=lambda _: self._call(self.choose), hint=hint)
         self.legend = ViewerMarkdown("legend", lambda: self._legend)
         self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._call(self.observe_now))
-        name, value = "max_gaussians", self._model.strategy.max_gaussians
-        hint = "Hard cap, from the next densification on"
-        self.set_max_gaussians = ViewerNumber(name, value, cb_hook=partial(self._change, name), hint=hint)
-        name, value = "tau_split", self._model.strategy.tau_split
-        hint = "Share of observations that must violate, at the next structure step"
-        hook, (low, high) = partial(self._change, name), RANGES[name]
-        self.set_tau_split = ViewerSlider(name, value, low, high, 0.05, cb_hook=hook, hint=hint)
+        strategy, hint, hook = self._model.strategy, "Hard cap, from the next densification on", self._change
+        self.set_max_gaussians = ViewerNumber("max_gaussians", strategy.max_gaussians, cb_hook=hook, hint=hint)
+        hint, (low, high) = "Share of observations that must violate, at the next structure step", RANGES["tau_split"]
+        self.set_tau_split = ViewerSlider("tau_split", strategy.tau_split, low, high, 0.05, cb_hook=hook, hint=hint)
         self.table = ViewerMarkdown("counts", self._describe)
         self.viewer = ViewerControl()
 
@@ -124,8 +113,8 @@ class StructurePanel(torch.nn.Module):
         self._status = status
         self.table.refresh()
 
-    def _change(self, name: str, element: ViewerParameter) -> None:
-        plan = self._model.plan
+    def _change(self, element: ViewerNumber | ViewerSlider) -> None:
+        plan, name = self._model.plan, element.name  # elements have the names of the strategy's fields
         try:
             if element.value != getattr(plan.strategy, name):
                 self._model.follow(changed(plan, name, element.value))

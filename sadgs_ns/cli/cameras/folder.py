@@ -158,13 +158,11 @@ def _stem(name: str) -> str:
 
 def _is_mask(path: Path) -> bool:
     """Return whether an image has two colours at most, or nearly all of it is black or white."""
-    try:
-        with Image.open(path) as image:
-            pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)).reshape(-1, 3)
-    except Exception:  # A damaged image is named when it is read.
-        return False
-    is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
-    return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
+    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged image is named when it is read.
+        pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)).reshape(-1, 3)
+        is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
+        return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
+    return False
 
 
 def _is_swept(path: Path) -> bool:
@@ -196,18 +194,16 @@ def _is_copy(photo: Path, other: Path) -> bool:
     """Return whether photos are equal, or have one name and differ in size, format or tone alone."""
     if filecmp.cmp(photo, other, shallow=False):
         return True
-    try:
-        with Image.open(photo) as one, Image.open(other) as two:
-            is_rig = one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix
-            if is_rig or _stem(photo.name) != _stem(other.name):
-                return False
-            one.draft("L", (64, 64))
-            two.draft("L", (64, 64))
-            a, b = (ImageOps.exif_transpose(image).convert("L") for image in (one, two))
-    except Exception:  # A damaged photo is named when it is read.
-        return False
-    if not 0.97 < a.width * b.height / (a.height * b.width) < 1.03:
-        return False
-    small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (a, b)]
-    with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
-        return bool(np.corrcoef(small)[0, 1] > 0.99)  # Smaller copies of photos reach .999.
+    # A damaged photo is named when it is read.
+    with contextlib.suppress(Exception), Image.open(photo) as one, Image.open(other) as two:
+        is_rig = one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix
+        if is_rig or _stem(photo.name) != _stem(other.name):
+            return False
+        one.draft("L", (64, 64))
+        two.draft("L", (64, 64))
+        a, b = (ImageOps.exif_transpose(image).convert("L") for image in (one, two))
+        small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (a, b)]
+        with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
+            is_alike = np.corrcoef(small)[0, 1] > 0.99  # Smaller copies of photos reach .999.
+        return bool(is_alike and 0.97 < a.width * b.height / (a.height * b.width) < 1.03)
+    return False

@@ -150,21 +150,19 @@ def match(
 
     A GPU compares the features and COLMAP verifies the matches; without one COLMAP does both, by lists in `pairs.txt`.
     """
+    from sadgs_ns.cli.cameras.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
+
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
     progress(stage, 0, 1)
     if matching == "similar":
-        from sadgs_ns.cli.cameras.matching import similar_photos
-
         panorama = {view: views[0] for views in rigs for view in views}
         pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
     else:
         pairs = choose_pairs(names, rigs, matching)
     if gpu is not None:
-        from sadgs_ns.cli.cameras.matching import write_matches
-
         write_matches(database, pairs, gpu, stage)
         # It verifies pairs that failed again each time, so all are verified in one call.
         pycolmap.geometric_verification(database, two_view_geometry_options=verification)
