@@ -157,7 +157,8 @@ def _last_sentence(lines: Sequence[str]) -> str:
     """Return the last sentence that a command printed; of a box, as around a wrong option, the first paragraph."""
     if lines and lines[-1].startswith("╰"):
         boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
-        return " ".join(text for text in itertools.takewhile(lambda text: not text.startswith("──"), boxed) if text)
+        paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
+        return " ".join(text for text in paragraph if text)
     told = (line.strip() for line in reversed(lines) if re.search(r"\w", line) and not line.startswith(_PROMPT))
     return _PREFIX.sub("", next(told, "it printed nothing"))
 

@@ -100,6 +100,7 @@ def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, mean
     """
     position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
     depths = (means - position) @ forward
-    middle = depths[np.linalg.norm(means - position - depths[:, None] * forward, axis=1) < 0.2 * depths]
+    across = np.linalg.norm(means - position - depths[:, None] * forward, axis=1)
+    middle = depths[across < 0.2 * depths]
     target = position + forward * (np.median(middle) if len(middle) else 1.0)
     return Start(tuple(position.tolist()), tuple(target.tolist()), math.degrees(2 * math.atan(side / (2 * focal))))

@@ -90,7 +90,8 @@ class Fusion:
         if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:
             problem = f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory"
             raise InputError(f"{problem}: give a larger one, such as --voxel-size {2 * self.voxel_size:.2g}.")
-        self._grid.integrate(blocks, camera.pop("depth"), self._image(self._core.Tensor(view.color)), **camera)
+        color = self._image(self._core.Tensor(view.color))
+        self._grid.integrate(blocks, camera.pop("depth"), color, **camera)
 
     def mesh(self) -> TriangleMesh:
         """Return the surface, `without_small_parts`; it has no triangles if the views showed none."""

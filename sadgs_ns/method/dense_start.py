@@ -98,7 +98,8 @@ def _places(points: Tensor, viewmat: Tensor, depths: DepthMap) -> tuple[Tensor, 
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = in_camera[:, 2]
     size = points.new_tensor([depths.depth.shape[1], depths.depth.shape[0]])
-    return depth, (in_camera[:, :2] / depth[:, None] * depths.K.diagonal()[:2] + depths.K[:2, 2]) / size
+    pixels = in_camera[:, :2] / depth[:, None] * depths.K.diagonal()[:2] + depths.K[:2, 2]
+    return depth, pixels / size
 
 
 def _read(values: Tensor, places: Tensor) -> Tensor:

@@ -42,7 +42,8 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     jacobian = torch.stack([fx / z, zero, -fx * x / z2, zero, fy / z, -fy * y / z2], dim=-1)
     jacobian = jacobian.reshape(*z.shape, 2, 3)
     covars2d = torch.einsum("...ij,...jk,...kl->...il", jacobian, covars, jacobian.transpose(-1, -2))
-    return torch.einsum("cij,cnj->cni", Ks[:, :2, :3], means) / z[..., None], covars2d
+    means2d = torch.einsum("cij,cnj->cni", Ks[:, :2, :3], means)
+    return means2d / z[..., None], covars2d
 
 
 def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:

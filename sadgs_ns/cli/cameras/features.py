@@ -106,7 +106,8 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
         rig.rig_id = opened.write_rig(rig)
     frame = pycolmap.Frame(rig_id=rig.rig_id)
     for sensor, name in zip(sorted(rig.sensor_ids(), key=lambda sensor: sensor.id), views, strict=True):
-        frame.add_data_id(pycolmap.data_t(sensor, opened.write_image(pycolmap.Image(name=name, camera_id=sensor.id))))
+        image_id = opened.write_image(pycolmap.Image(name=name, camera_id=sensor.id))
+        frame.add_data_id(pycolmap.data_t(sensor, image_id))
     opened.write_frame(frame)
 
 

@@ -54,4 +54,5 @@ def map_of_view(view: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     across = (np.arange(side) + 0.5) / side * 2 - 1  # The tangents of angles up to 45° from the view's axis
     rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1) @ rotations()[view].T
     x, y, z = np.moveaxis(rays.astype(np.float32), -1, 0)
-    return (1 + np.arctan2(x, z) / np.pi) * height - 0.5, (0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi) * height - 0.5
+    columns, rows = 1 + np.arctan2(x, z) / np.pi, 0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi
+    return columns * height - 0.5, rows * height - 0.5
