@@ -8,6 +8,7 @@ TIFF, LZW TIFF and BMP become 8-bit RGB in the scene.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import dataclasses
 import errno
@@ -331,7 +332,7 @@ def heic(folder: Path) -> None:
 
 
 @pytest.mark.hard_case(
-    "images that are not read: HEIC, also named `.jpg`, raw files, JPEG XL, GIF, and JPEG of an unknown suffix",
+    "images that are not read: damaged HEIC, also named `.jpg`, raw files, JPEG XL, GIF, and JPEG of an unknown suffix",
     "counted in a line; the others are used",
 )
 def test_photos_that_are_not_read_are_told_beside_those_that_are(
@@ -848,6 +849,34 @@ def test_photos_with_a_profile_of_other_colors_become_srgb(suffix: str, tmp_path
     with Image.open(folder / names[1]) as image:
         assert np.abs(np.array(image)[8, 8].astype(int) - [40, 200, 10]).max() <= 6
         assert image.info.get("icc_profile") != swapped
+
+
+HEIC = base64.b85decode(  # 64 × 48 px, the left half blue and the right one red, to be turned by EXIF's orientation 6
+    "0000SW^{RQXk}?*00000ZE0pPXk}?*ZE0a<0005VZDn*}000000000XXk=`10000000000aA{+700000000000000000000G-+&a"
+    "V*mgE07O6l0ssL300001>;M4(00000004FX0ssI200LqF0RR9100000HUIzsIB98aW&i*H00062000$fZf0cy000000RRAKc4ILB"
+    "0000LX>Mj^0ssI300IC2MR;ju000004sdC7Z2$lO00031009SSaB^?}008D`aAR)(004Gqc4I>U18@KU0FVFx0000U@BsY%`1k+-"
+    "4+CHT0RR|40Sp2E{{wIU00RJ!0009300RIXx&lC90096hLID8-Z~y=U0FVFx0{{R603M(qfd!W8<fgf}2xu@M00096AOHXZ03l)k"
+    "0RRR>0l{;?i2wiq6Ju{|a&BX6cmM$a4FCp!0000KX>)L8000000000$0000$0000eV{Bn?0000$000010000m000010000000002"
+    "|NsB+000020000GaA|mH000000|*ER00009X>xCL0{{R38EJ5BVE_OC000000RRC8fdT^sgoXeB02*m>Wo7^X0000001jhhb7KGk"
+    "009620002AZDe6|0001TC;_hqIEgNNFZcsr_5azmfB*S*BAM#@Tu1-?oQ=)@V}vIEz)slsX9538)AVvY_sH_`Vx`7ho&ZGTx8Fij"
+    "L)n*5{8*JZVDok(UpTRccRPbU8;W?op#_oUNM-6NAA!;v)4S9g+KhP??dzvO9KZko00u>PX=VTbO-%qQ0000800IFJ00IC200sa6"
+    "044zv00RI30096700000002;EZ*FA("
+)
+
+
+@pytest.mark.hard_case("a phone's HEIC", "is read upright, and becomes JPEG")
+def test_heic_is_read_as_a_phone_means_it(tmp_path: Path):
+    (tmp_path / "IMG_1.HEIC").write_bytes(HEIC)
+    names, masks, told = look_into(tmp_path, tmp_path / "out")
+    assert names == ["IMG_1.HEIC"] and not masks and not told
+    (photo,) = read_photos(tmp_path, names, lambda *step: None)
+    assert photo.size == (48, 64) and not photo.is_turned and "Phone" in photo.camera
+    folder, (converted,) = convert_photos(tmp_path, [photo], tmp_path / "converted")
+    assert converted.name == "IMG_1.HEIC.jpg"
+    with Image.open(folder / converted.name) as image:
+        assert image.format == "JPEG" and image.size == (48, 64) and image.getexif().get(0x112, 1) == 1
+        for place, color in {(24, 10): (20, 60, 220), (24, 54): (200, 40, 10)}.items():
+            assert np.abs(np.array(image)[place[::-1]].astype(int) - color).max() <= 8
 
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")

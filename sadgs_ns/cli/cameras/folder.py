@@ -12,6 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
+import pi_heif
 from PIL import ExifTags, Image, ImageOps
 
 from sadgs_ns.cli.program import read_settings
@@ -21,12 +22,13 @@ from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 
+pi_heif.register_heif_opener()  # Pillow then reads HEIC.
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
-_FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF"}
+_FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-"""Suffixes of formats that are not read. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
+"""Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
@@ -153,7 +155,7 @@ def _kind(path: Path) -> str:
 def _stem(name: str) -> str:
     """Return the part of a photo's name that its mask and copies share."""
     stem = Path(_VARIANT.sub("", Path(name).stem.lower()))
-    return stem.stem if stem.suffix in IMAGE_SUFFIXES else stem.name
+    return stem.stem if stem.suffix in IMAGE_SUFFIXES | _RAW_OR_HEIC else stem.name
 
 
 def _is_mask(path: Path) -> bool:
