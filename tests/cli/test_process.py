@@ -879,6 +879,15 @@ def test_heic_is_read_as_a_phone_means_it(tmp_path: Path):
             assert np.abs(np.array(image)[place[::-1]].astype(int) - color).max() <= 8
 
 
+@pytest.mark.hard_case("HEIC, without the library that reads it, as in an older environment", "a line counts the files")
+def test_heic_is_left_out_without_its_library(tmp_path: Path):
+    (tmp_path / "IMG_1.HEIC").write_bytes(HEIC)
+    code = "import sys; sys.modules['pi_heif'] = None; from sadgs_ns.cli.cameras.folder import look_into as look; "
+    code += "from pathlib import Path; print(look(Path(sys.argv[1]), Path('out')))"
+    told = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True).stdout
+    assert told.startswith("([], {}, ['Left out as images that are not read ") and "1, such as IMG_1.HEIC" in told
+
+
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")
 def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
     """The folder of its database does not exist."""

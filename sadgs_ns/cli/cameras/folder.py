@@ -12,7 +12,6 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
-import pi_heif
 from PIL import ExifTags, Image, ImageOps
 
 from sadgs_ns.cli.program import read_settings
@@ -22,7 +21,10 @@ from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 
-pi_heif.register_heif_opener()  # Pillow then reads HEIC.
+with contextlib.suppress(ImportError):  # In an older environment HEIC is left out.
+    import pi_heif
+
+    pi_heif.register_heif_opener()  # Pillow then reads HEIC.
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
