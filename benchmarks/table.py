@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -230,8 +229,10 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) ->
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
     known = [COLUMNS[name] for name in columns]
     lines = [[cell(column, run) for _, column in known] for run in runs]
-    for above, line in reversed(list(itertools.pairwise(lines))):
-        line[0] = line[0] if line[0] != above[0] else ""
+    firsts = [line[0] for line in lines]
+    for line, above in zip(lines[1:], firsts[:-1], strict=True):
+        if line[0] == above:
+            line[0] = ""
     return grid([header for header, _ in known], lines, sum(name in WORDS for name in columns))
 
 

@@ -21,10 +21,6 @@ from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 
-with contextlib.suppress(ImportError):  # In an older environment HEIC is left out.
-    import pi_heif
-
-    pi_heif.register_heif_opener()  # Pillow then reads HEIC.
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
@@ -108,6 +104,10 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
 
     Names are relative to the folder. The scene's own photos stay photos. Hidden files and scenes' files are left out.
     """
+    with contextlib.suppress(ImportError):  # In an older environment HEIC is left out.
+        import pi_heif
+
+        pi_heif.register_heif_opener()  # Pillow then reads HEIC, but not where poses are given: training would not.
     folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
     files = _visible_files(folder)
     settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
