@@ -65,7 +65,7 @@ def values(group: Iterable[Result], name: str) -> list[float]:
 def mean(group: Iterable[Result], name: str) -> float | None:
     """Mean of a field over the results that have it; None if none does."""
     known = values(group, name)
-    return sum(known) / len(known) if known else None
+    return statistics.fmean(known) if known else None
 
 
 Cell = Sequence[Sequence[Result]]
@@ -75,7 +75,7 @@ Cell = Sequence[Sequence[Result]]
 def mean_over_scenes(cell: Cell, name: str) -> float | None:
     """Mean over scenes of the means over seeds; None if a scene has no number."""
     known = [value for group in cell if (value := mean(group, name)) is not None]
-    return sum(known) / len(known) if known and len(known) == len(cell) else None
+    return statistics.fmean(known) if known and len(known) == len(cell) else None
 
 
 def deviation(cell: Cell, name: str) -> float | None:
@@ -84,7 +84,8 @@ def deviation(cell: Cell, name: str) -> float | None:
     freedom = sum(len(numbers) - 1 for numbers in known)
     if freedom < 2:
         return None
-    return math.sqrt(sum((len(numbers) - 1) * statistics.variance(numbers) for numbers in known) / freedom)
+    # `sum` rounds differently from Python 3.12 on.
+    return math.sqrt(math.fsum((len(numbers) - 1) * statistics.variance(numbers) for numbers in known) / freedom)
 
 
 def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float | None:
