@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
@@ -110,6 +110,7 @@ def copy(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     "it parses or raises within 20 s of CPU time and 1 GiB",
 )
 @given(st.lists(damages, min_size=1, max_size=3))
+@example([("images.bin", ("flip", 0.33887574379230695, 121))])  # A name with a character that ends a line
 @FEW
 def test_a_damaged_colmap_model_parses_or_raises_within_bounds(
     scene: Path, copy: Path, changes: list[tuple[str, tuple[str, float, int]]]

@@ -20,6 +20,11 @@ class Finding:
     severity: Literal["error", "warning", "note"]  # Training is refused, may disappoint, or is worth a remark
     sentence: str  # A sentence that names the file and the remedy
 
+    def __post_init__(self) -> None:
+        """Escape what a damaged file's names can hold, such as a line's end."""
+        printable = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in self.sentence)
+        object.__setattr__(self, "sentence", printable)
+
 
 fault, warning, note = (functools.partial(Finding, severity) for severity in ("error", "warning", "note"))
 """Make a finding of each severity of its sentence."""
