@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sadgs_ns.data import ply
 from sadgs_ns.data.text import check_byte_order_mark
 from sadgs_ns.errors import InputError, reason
 
@@ -195,12 +196,13 @@ def read_poses(path: Path) -> list[Pose]:
 
 
 def points_file(model: Path) -> Path | None:
-    """Return a reconstruction's file of points, or None; of two the one of the cameras' kind, as is of one model."""
-    kinds = (model_kind(model), "bin", "txt")
+    """Return a reconstruction's file of points, or None; of several that of the cameras' kind, as is of one model."""
+    kinds = (model_kind(model), "bin", "txt", "ply")
     return next((path for kind in kinds if (path := model / f"points3D.{kind}").is_file()), None)
 
 
 def read_points(path: Path) -> Points:
-    """Return the points of a `points3D.bin` or `points3D.txt`; raises as `read_cameras`."""
+    """Return the points of a `points3D.bin`, `.txt` or `.ply`; raises as `read_cameras`."""
+    readers = {".bin": _read_binary_points, ".txt": _read_text_points, ".ply": ply.read_points}
     with _errors_as_sentences(path):
-        return (_read_binary_points if path.suffix == ".bin" else _read_text_points)(path)
+        return readers[path.suffix](path)

@@ -27,8 +27,9 @@ from runs import blender_data, configure, nerfstudio_data, train
 from scenes import HEIGHT, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.parsers import AutomaticDataParserConfig, check_capture, choose_parser
+from sadgs_ns.data.parsers import AutomaticDataParserConfig, ColmapParser, check_capture, choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 
@@ -118,6 +119,24 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     if isinstance(config.dataparser, ColmapDataParserConfig):
         parsed = config.dataparser.setup().get_dataparser_outputs()
         assert len(parsed.image_filenames) == 8 and all(path.is_file() for path in parsed.image_filenames)
+
+
+@pytest.mark.hard_case(
+    "a COLMAP model whose points are in `points3D.ply` alone, as programs for splats write it",
+    "trains from these points; it was refused as without any",
+)
+def test_the_points_of_a_model_may_be_in_a_ply(scene: Path, tmp_path: Path):
+    colmap_in("sparse/0")(scene, tmp_path)
+    binary = tmp_path / "sparse/0/points3D.bin"
+    pycolmap.Reconstruction(binary.parent).export_PLY(binary.with_suffix(".ply"))
+    positions, colors = colmap.read_points(binary)
+    binary.unlink()
+    config = SadgsDatamanagerConfig(data=tmp_path)
+    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    config.dataparser._target = ColmapParser
+    metadata = config.dataparser.setup().get_dataparser_outputs().metadata
+    assert {*map(tuple, metadata["points3D_rgb"].tolist())} == {*map(tuple, colors.tolist())}
+    assert len(metadata["points3D_xyz"]) == len(positions)
 
 
 @pytest.mark.hard_case(

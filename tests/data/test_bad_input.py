@@ -445,7 +445,10 @@ COLMAP = {
         patch(f"{SPARSE}/images.bin", 8 + 64 + 8, "<Q", 2**60),
         r"\S+/images\.bin is cut off or corrupt \(it ends after \d+ bytes, .*\): copy it again, or .*\.",
     ),
-    "points-missing": (remove(f"{SPARSE}/points3D.bin"), r"\S+ has no points3D\.bin or \.txt: .*random points\."),
+    "points-missing": (
+        remove(f"{SPARSE}/points3D.bin"),
+        r"\S+ has no points3D\.bin, \.txt or \.ply: .*random points\.",
+    ),
     "points-empty": (
         model(lambda cameras, images, points: points.clear()),
         r"\S+/points3D\.bin holds no SfM point: .*--load-3D-points False.*\.",

@@ -57,7 +57,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
         if (points := colmap.points_file(model_folder)) is None:
-            yield fault(f"{model_folder} has no points3D.bin or .txt: copy the whole reconstruction, or {random}.")
+            yield fault(f"{model_folder} has no points3D.bin, .txt or .ply: copy the whole reconstruction, or {random}.")
         else:
             remedy = f"run COLMAP's mapper again, or {random}"
             yield from check_points(colmap.read_points(points), views if sound else [], points, remedy)
