@@ -135,8 +135,7 @@ def _check(options: Export) -> None:
 def _check_steps(similarity: Similarity, log_size: float) -> None:
     """Raise InputError if float32, in which files hold positions, has larger steps in a frame than Gaussians' size."""
     place = float(np.abs(similarity.translation).max())
-    step = float(np.spacing(np.float32(place)))
-    if step > similarity.scale * math.exp(log_size):
+    if (step := float(np.spacing(np.float32(place)))) > similarity.scale * math.exp(log_size):
         told = f"--frame colmap puts the splat {place:.3g} units from the origin, where float32 has steps of {step:.2g}"
         raise InputError(f"{told}: leave it out, and place the file by the transform in the run's {TRANSFORMS_NAME}.")
 
@@ -211,8 +210,7 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     try:
         of_parameters(_arrays(params))
     except ValueError as error:
-        problem = f"{checkpoint} holds no Gaussians that can be exported ({error})"
-        raise InputError(f"{problem}: {_REMEDY}.") from error
+        raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
     state = loaded.get("_extra_state")
     plan = state.get("plan", {}) if isinstance(state, dict) else {}
     defaults = {"near_plane": RenderOptions.near_plane, "max_off_axis": _MAX_OFF_AXIS}

@@ -172,8 +172,7 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
         )
     }
     ellipses = maps.draw_ellipses(to_picture(view.photo), view.structure_tensor, constant, size)
-    title = f"{view.name}: the structure tensor, its inverse as ellipses"
-    return {"ellipses": Panel(title, ellipses, PERIOD)} | panels
+    return {"ellipses": Panel(f"{view.name}: the structure tensor, its inverse as ellipses", ellipses, PERIOD)} | panels
 
 
 def step_panels(

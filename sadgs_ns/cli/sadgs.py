@@ -240,8 +240,7 @@ class PhotosToSplat:
         with contextlib.suppress(InputError):  # It is about another folder.
             if self.source.name.startswith("images") and (other := find_cameras(self.source.parent)):
                 line.print(f"{other} is not used: `sadgs {shlex.quote(str(self.source.parent))}` takes these cameras.")
-        few = self._settings.get("few")
-        if few and (self.options.anyway or self._checkpoint()) and not self._added:
+        if (few := self._settings.get("few")) and (self.options.anyway or self._checkpoint()) and not self._added:
             return f"{few}; done before"
         added, done_before = "", ""
 
@@ -315,8 +314,7 @@ class PhotosToSplat:
         command += ["--timestamp", self._run.name, "--vis", "tensorboard" if measures else "none"]  # for the measures
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
-        worker = self._trainer or self.worker("training", _TRAINING)
-        self.call(worker, line, on_event, [*command, *self.train_options])
+        self.call(self._trainer or self.worker("training", _TRAINING), line, on_event, [*command, *self.train_options])
         if not self._checkpoint():
             raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
         told = f"{total} iterations, {count} Gaussians"

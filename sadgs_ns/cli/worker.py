@@ -157,8 +157,7 @@ def _last_sentence(lines: Sequence[str]) -> str:
     """Return the last sentence that a command printed; of a box, as around a wrong option, the first paragraph."""
     if lines and lines[-1].startswith("╰"):
         boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
-        paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
-        return " ".join(text for text in paragraph if text)
+        return " ".join(text for text in itertools.takewhile(lambda text: not text.startswith("──"), boxed) if text)
     told = (line.strip() for line in reversed(lines) if re.search(r"\w", line) and not line.startswith(_PROMPT))
     return _PREFIX.sub("", next(told, "it printed nothing"))
 
@@ -187,8 +186,7 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(128 + signal.SIGINT) from None
     except Exception as error:
-        sentence = sentence_of(error)
-        if sentence is None:
+        if (sentence := sentence_of(error)) is None:
             tracebacks.print_exc()
             sentence = tracebacks.format_exception_only(error)[-1].strip()
         else:

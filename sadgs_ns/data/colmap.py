@@ -66,8 +66,7 @@ class _Binary:
 
     def text(self) -> str:
         """Return the next string, which ends with a zero byte."""
-        end = self.content.find(b"\0", self.offset, self.offset + 4096)
-        if end < 0:
+        if (end := self.content.find(b"\0", self.offset, self.offset + 4096)) < 0:
             raise self.corrupt(f"at byte {self.offset} there is no image's name")
         raw, self.offset = self.content[self.offset : end], end + 1
         try:
@@ -124,8 +123,7 @@ def _read_text(path: Path, minimum: int, numbered: bool = True) -> Iterator[tupl
         file.seek(0)
         for line in file:
             if line.strip() and not line.lstrip().startswith("#"):
-                fields = line.split()
-                if len(fields) < minimum:
+                if len(fields := line.split()) < minimum:
                     raise ValueError(f"{minimum} fields expected in {line.strip()[:60]!r}")
                 if fields[0] in numbers:
                     raise ValueError(f"two lines have the number {fields[0]}")

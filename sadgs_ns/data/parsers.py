@@ -140,8 +140,7 @@ class TransformsParser(_PointsOfPly, Nerfstudio):
 
     def _generate_dataparser_outputs(self, split: str = "train") -> DataparserOutputs:
         path = self.config.data if self.config.data.suffix == ".json" else self.config.data / "transforms.json"
-        model = path.parent / COLMAP_FOLDERS[0]
-        if model.exists():
+        if (model := path.parent / COLMAP_FOLDERS[0]).exists():
             self.prompted_user, self.create_pc = True, False  # The answer no; the points are read below.
         meta = read_transforms(path)
         self._middle, middle = _centre(meta, self.config.center_method)

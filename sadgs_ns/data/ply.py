@@ -34,8 +34,7 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     except Exception as error:  # A damaged header may lead plyfile's parser to anything.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
     named = {name.lower(): name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
-    channels = next((names for names in COLORS if named.keys() >= set(names)), None)
-    if channels is None:
+    if (channels := next((names for names in COLORS if named.keys() >= set(names)), None)) is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
     colors = np.stack([vertices[named[channel]] for channel in channels], axis=-1).astype(np.float64)
     largest = colors[np.isfinite(colors)].max(initial=0.0)

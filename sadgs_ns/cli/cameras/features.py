@@ -123,8 +123,7 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
     points, values = (), None
     if image is not None:
         height, width = image.shape
-        shrink = min(1.0, MAX_SIDE / max(width, height))
-        if shrink < 1:
+        if (shrink := min(1.0, MAX_SIDE / max(width, height))) < 1:
             size = max(1, round(shrink * width)), max(1, round(shrink * height))
             image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         finder = cv2.SIFT.create(MOST_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)

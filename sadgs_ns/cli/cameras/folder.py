@@ -134,8 +134,7 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         else:
             found["masks of no photo"].append(name)
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
-    told = [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
-    return photos, masks, told
+    return photos, masks, [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
 
 
 def _kind(path: Path) -> str:
@@ -173,8 +172,7 @@ def _is_swept(path: Path) -> bool:
     """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
     with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
         is_whole, lens = image.width == 2 * image.height, Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
-        by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
-        return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
+        return not is_whole and (lens.get(ExifTags.Base.CustomRendered) == 6 or b"GPano:" in image.info.get("xmp", b""))
     return False
 
 

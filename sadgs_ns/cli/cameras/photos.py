@@ -184,8 +184,7 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
 
 def _in_srgb(image: Image.Image, mode: str) -> Image.Image:
     """Convert an image to RGB or RGBA in sRGB, since training and viewers know no profiles."""
-    profile = color_profile(image)
-    if profile is None:
+    if (profile := color_profile(image)) is None:
         return image.convert(mode)
     image = image if image.mode == "CMYK" else image.convert(mode)
     with contextlib.suppress(ImageCms.PyCMSError):  # The profile is of another kind of pixels.
@@ -236,8 +235,7 @@ def write_masks(
 def restore_alpha(images: Path, alphas: Path) -> None:
     """Give those images that exist the opacity that `write_alpha` wrote, which has their size."""
     for path in alphas.rglob("*.png"):
-        target = images / path.relative_to(alphas).with_suffix("")
-        if target.exists():
+        if (target := images / path.relative_to(alphas).with_suffix("")).exists():
             with Image.open(target) as image, Image.open(path) as alpha:
                 pixels = image.convert("RGB")
                 pixels.putalpha(alpha.convert("L"))

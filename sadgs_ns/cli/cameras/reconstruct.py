@@ -289,8 +289,7 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
             progress("undistorted photos", written, len(registered))
         undistortion.result()
     for kind, image in itertools.product(("alpha", "masks"), registered):
-        stored = model.with_name(kind) / f"{image.name}.png"
-        if stored.exists():
+        if (stored := model.with_name(kind) / f"{image.name}.png").exists():
             target = folder / kind / f"{image.name}.png"
             target.parent.mkdir(parents=True, exist_ok=True)
             grey = pycolmap.Bitmap.read(stored, as_rgb=False)
@@ -320,8 +319,7 @@ def summarize(
             for identity in pycolmap.pair_id_to_image_pair(pair):
                 matches[identity] = max(matches[identity], count)
         for name in set(names) - registered:
-            identity = identities.get(name)
-            if identity is None:
+            if (identity := identities.get(name)) is None:
                 left_out[name] = "could not be read"
             elif (count := opened.num_keypoints_for_image(identity)) < FEW_FEATURES:
                 left_out[name] = f"only {count} features: blurred, dark or without texture"

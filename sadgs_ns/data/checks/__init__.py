@@ -14,8 +14,7 @@ from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 @collect_findings
 def check_data(data: Path) -> Iterator[Finding]:
     """Return findings on a folder, or on a `transforms.json`, as `ns-train` reads it where no parser is named."""
-    layout = layout_of(data)
-    if layout == "colmap":
+    if (layout := layout_of(data)) == "colmap":
         yield from check_colmap(data, automatic_options(data))
     elif layout == "blender":
         yield from check_blender(data, ParserOptions())

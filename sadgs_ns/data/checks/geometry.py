@@ -112,8 +112,7 @@ def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
 
 def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     centres = np.stack([view.centre for view in views])  # [V, 3]
-    largest = np.abs(centres - centres.mean(axis=0)).max()
-    if len(centres) > 1 and largest <= 1e-9 * max(np.abs(centres).max(), 1.0):
+    if len(centres) > 1 and np.abs(centres - centres.mean(axis=0)).max() <= 1e-9 * max(np.abs(centres).max(), 1.0):
         yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
     _, distances, spread = _spread(centres)
@@ -235,8 +234,7 @@ def _fit(positions: NDArray[np.float64], colors: NDArray[np.uint8], view: View) 
 
 
 def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    far = far_outliers(positions, POINT_SHARE)
-    if far.any():
+    if (far := far_outliers(positions, POINT_SHARE)).any():
         told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
         yield note(f"{path} has {told}: training leaves them out.")
     positions = positions[~far]
@@ -248,8 +246,7 @@ def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path
         kind = fault if distance > 1e5 * spread else warning
         yield kind(f"{told}, so that all images see them from one direction: {remedy}.")
         return
-    seeing = _share_of_views_with_points(positions, views)
-    if seeing < 0.5:
+    if (seeing := _share_of_views_with_points(positions, views)) < 0.5:
         whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
         yield (warning if seeing else fault)(f"{path} has points that {whom} can see in front of it: {remedy}.")
 
