@@ -158,6 +158,25 @@ def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path
     assert config.dataparser.images_path == expected_parser.images_path
 
 
+@pytest.mark.hard_case(
+    "models of as many images in `sparse` and `sparse/0`, as after undistorting in place; a copy of one model",
+    "a warning: names the options that train on the other; none",
+)
+def test_another_model_of_as_many_images_is_told(scene: Path, tmp_path: Path):
+    colmap_in("sparse/0")(scene, tmp_path)
+    for file in (tmp_path / "sparse/0").iterdir():
+        shutil.copy(file, tmp_path / "sparse")
+    assert [finding for finding in check_data(tmp_path) if finding.severity != "note"] == []
+    model = pycolmap.Reconstruction(tmp_path / "sparse")
+    model.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), [5.0, 0.0, 0.0]))
+    model.write(tmp_path / "sparse")
+    (told,) = [finding.sentence for finding in check_data(tmp_path) if finding.severity == "warning"]
+    assert told == (
+        f"{tmp_path}/sparse/0/images.bin has {VIEWS} images, {tmp_path}/sparse has {VIEWS}: end the command with "
+        "`colmap --colmap-path sparse` to train on those."
+    )
+
+
 @pytest.mark.hard_case("`sparse/1` has more images than `sparse/0`", "a warning: names the options that train on it")
 def test_a_larger_model_is_told(scene: Path, tmp_path: Path):
     colmap_in("sparse/1")(scene, tmp_path)

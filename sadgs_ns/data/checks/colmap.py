@@ -64,7 +64,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
-    """Refuse a folder of images that are not those of the model, and warn of a larger model beside it."""
+    """Refuse a folder of images that are not those of the model, and warn of another or larger model beside it."""
     folder = data / options.images_path
     if not any(os.path.isfile(folder / name) for name in names):
         if found := layouts.images_folder(data, options.colmap_path, names):
@@ -77,7 +77,9 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
                 f"the command with `colmap {_words(data, options, names)} --images-path FOLDER`."
             )
     for other, others in layouts.find_reconstructions(data).items():
-        if len(others) > len(names):
+        twin = data / other / poses.name  # The same file, as in a copy, is no other model.
+        differs = len(others) == len(names) and twin.is_file() and twin.read_bytes() != poses.read_bytes()
+        if len(others) > len(names) or differs:
             problem = f"{poses} has {len(names)} images, {data / other} has {len(others)}"
             words = _words(data, dataclasses.replace(options, colmap_path=other), others)
             yield warning(f"{problem}: end the command with `colmap {words}` to train on those.")
