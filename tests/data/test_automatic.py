@@ -356,24 +356,83 @@ def test_a_question_that_a_named_parser_would_ask_nobody_is_an_error(large: Path
     assert "nerfstudio will ask whether to make it with ffmpeg; say yes, or add `--down" in warning.sentence
 
 
+def in_a_fourth(data: Path, kind: str = "images") -> None:
+    """Put copies of a fourth of the size beside images or masks."""
+    (data / f"{kind}_4").mkdir()
+    for path in (data / kind).iterdir():
+        with Image.open(path) as image:
+            image.resize((image.width // 4, image.height // 4)).save(data / f"{kind}_4" / path.name)
+
+
+@pytest.mark.hard_case(
+    "images of a fourth of the size alone, as `images_4` of DL3DV or Mip-NeRF 360 without `images`",
+    "refused: `--downscale-factor 4`, with which it trains; with a COLMAP model that was refused, too",
+)
+@pytest.mark.parametrize("layout", ["colmap", "transforms.json"])
+def test_smaller_copies_without_the_images_are_read_by_the_option_that_is_told(
+    layout: str, scene: Path, tmp_path: Path
+):
+    data = tmp_path / "capture"
+    nerfstudio_data(data) if layout == "transforms.json" else colmap_in("sparse/0")(scene, data)
+    in_a_fourth(data)
+    shutil.rmtree(data / "images")
+    with pytest.raises(InputError) as refused:
+        check_capture(SadgsDatamanagerConfig(data=data))
+    options = {
+        "colmap": "`colmap --colmap-path sparse/0 --images-path FOLDER`, or --downscale-factor 4 for images_4.",
+        "transforms.json": "`nerfstudio-data --downscale-factor 4`.",
+    }
+    assert str(refused.value).endswith(f" end the command with {options[layout]}")
+    words = ["colmap", "--colmap-path", "sparse/0"] if layout == "colmap" else ["nerfstudio-data"]
+    config = parsed(*words, "--downscale-factor", "4")
+    config.data = config.dataparser.data = data
+    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    names = config.dataparser.setup().get_dataparser_outputs().image_filenames
+    assert all(name.is_file() and name.parent.name == "images_4" for name in names)
+
+
+@pytest.mark.hard_case(
+    "smaller copies of images, as ns-process-data makes them, and masks without such copies",
+    "refused: make them, or `--downscale-factor 1`, with which it trains",
+)
+def test_masks_without_smaller_copies_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    nerfstudio_data(tmp_path, masks=True)
+    for factor in (2, 4):
+        (tmp_path / f"images_{factor}").mkdir()
+        for path in (tmp_path / "images").iterdir():
+            with Image.open(path) as image:
+                image.resize((WIDTH // factor, HEIGHT // factor)).save(tmp_path / f"images_{factor}" / path.name)
+    with pytest.raises(InputError, match=r"/masks_4 does not exist, .*: make it, or end the command with `") as refused:
+        check_capture(SadgsDatamanagerConfig(data=tmp_path))
+    config = parsed(*str(refused.value).split("`")[1].split())
+    config.data = tmp_path
+    assert {finding.severity for finding in check_capture(config)} == {"note"}
+
+
 @pytest.mark.hard_case(
     "`--downscale-factor 8` on small images or without copies; `--downscale-factor 0`",
     "refused: leave that option out, and use `--pipeline.datamanager.camera-res-scale-factor 0.125`; refused by name",
 )
 def test_a_factor_without_copies_and_one_that_makes_nothing_smaller_are_named(scene: Path, tmp_path: Path):
-    named: list[Any] = [
-        ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER),
-        nerfstudio_data(tmp_path / "data"),
+    named: list[tuple[Any, str]] = [
+        (
+            ColmapDataParserConfig(data=scene, colmap_path=SPARSE_FOLDER),
+            "`--downscale-factor 8`: leave that option out, and put "
+            "`--pipeline.datamanager.camera-res-scale-factor 0.125` before the parser's name.",
+        ),
+        (
+            nerfstudio_data(tmp_path / "data"),
+            "8: make it, or end the command with `--pipeline.datamanager.camera-res-scale-factor 0.125 nerfstudio-data "
+            "--downscale-factor 1`.",
+        ),
     ]
-    for parser in named:
+    for parser, told in named:
         parser.downscale_factor = 8
         with pytest.raises(InputError) as refused:
             check_capture(SadgsDatamanagerConfig(dataparser=parser))
         folder = parser.data / "images_8"
-        assert str(refused.value) == (
-            f"{folder} does not exist, which should hold the images scaled down by `--downscale-factor 8`: leave that "
-            "option out, and put `--pipeline.datamanager.camera-res-scale-factor 0.125` before the parser's name."
-        )
+        assert str(refused.value) == (f"{folder} does not exist, which should hold the images scaled down by {told}")
         parser.downscale_factor = 0
         with pytest.raises(InputError, match=r"^downscale-factor must be at least 1, got 0\.$"):
             check_capture(SadgsDatamanagerConfig(dataparser=parser))

@@ -447,7 +447,7 @@ COLMAP = {
     ),
     "points-missing": (
         remove(f"{SPARSE}/points3D.bin"),
-        r"\S+ has no points3D\.bin, \.txt or \.ply: .*random points\.",
+        r"\S+ has no points3D file: .*random points\.",
     ),
     "points-empty": (
         model(lambda cameras, images, points: points.clear()),

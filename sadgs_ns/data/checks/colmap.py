@@ -57,7 +57,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
         if (points := colmap.points_file(model_folder)) is None:
-            yield fault(f"{model_folder} has no points3D.bin, .txt or .ply: copy the whole reconstruction, or {random}.")
+            yield fault(f"{model_folder} has no points3D file: copy the whole reconstruction, or {random}.")
         else:
             remedy = f"run COLMAP's mapper again, or {random}"
             yield from check_points(colmap.read_points(points), views if sound else [], points, remedy)
@@ -66,16 +66,16 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
     """Refuse a folder of images that are not those of the model, and warn of another or larger model beside it."""
     folder = data / options.images_path
-    if not any(os.path.isfile(folder / name) for name in names):
+    smaller = images.smaller_folder(folder, options.downscale_factor or 1)
+    if not any(os.path.isfile(place / name) for place in (folder, smaller) for name in names):
         if found := layouts.images_folder(data, options.colmap_path, names):
             problem = f"{poses}: image {names[0]} is not in {folder}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found), names)
             raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
         if not folder.is_dir():
-            raise InputError(
-                f"{poses} has poses of {len(names)} images, but there is no folder {folder}: put them there, or end "
-                f"the command with `colmap {_words(data, options, names)} --images-path FOLDER`."
-            )
+            problem = f"{poses} has poses of {len(names)} images, but there is no folder {folder}: put them there"
+            words = f"`colmap {_words(data, options, names)} --images-path FOLDER`"
+            raise InputError(f"{problem}, or end the command with {words}, or --downscale-factor 4 for images_4.")
     for other, others in layouts.find_reconstructions(data).items():
         twin = data / other / poses.name  # The same file, as in a copy, is no other model.
         differs = len(others) == len(names) and twin.is_file() and twin.read_bytes() != poses.read_bytes()
@@ -128,7 +128,9 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
     if factor == 1 or all((smaller / name).parent.exists() for name in names):
         return factor
     if options.downscale_factor is not None:
-        problem, remedy = images.no_copies(smaller, factor)
+        problem = f"{smaller} does not exist, which should hold the images scaled down by `--downscale-factor {factor}`"
+        scale = f"`--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}`"
+        remedy = f"leave that option out, and put {scale} before the parser's name"
     else:
         problem = f"{folder} holds images of more than {images.MAX_AUTO_RESOLUTION} px and there is no {smaller}"
         remedy = "add `--downscale-factor 1` after `colmap` to take them as they are"

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import IMAGE_SUFFIXES, colmap
-from sadgs_ns.data.checks import geometry
+from sadgs_ns.data.checks import geometry, images
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
-from sadgs_ns.data.checks.images import Frame, automatic_factor, check_images, image_size, no_copies, scaled_size
+from sadgs_ns.data.checks.images import Frame, check_images, scaled_size
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
@@ -40,11 +40,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     if model not in (known := (*_PERSPECTIVE, "OPENCV_FISHEYE", "FISHEYE624")):
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(known)}.")
     _check_transform(meta, path)
-    first, factor = folder / described[0]["file_path"], options.downscale_factor
-    if factor is None:
-        factor = automatic_factor(first, lambda by: folder / f"images_{by}" / first.name) if open_images else 1
-    if factor > 1 and not (folder / f"images_{factor}").is_dir():
-        raise InputError(": ".join(no_copies(folder / f"images_{factor}", factor)) + ".")
+    factor = _factor_of(described, folder, options) if open_images else options.downscale_factor or 1
 
     def locate(name: str, kind: str = "images") -> Path:
         return folder / (f"{kind}_{factor}/{Path(name).name}" if factor > 1 else name)  # Copies lie in one folder.
@@ -72,6 +68,24 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         yield from _check_ply(meta, path, views if sound else [])
 
 
+def _factor_of(described: Sequence[dict[str, Any]], folder: Path, options: ParserOptions) -> int:
+    """Return the downscale factor of the frames' images to read; raise InputError if these or masks are missing."""
+    first, factor = folder / described[0]["file_path"], options.downscale_factor
+    copies = {by: folder / f"images_{by}" / first.name for by in (2, 4, 8)}
+    if factor is None and not first.is_file() and (there := [by for by in copies if copies[by].is_file()]):
+        told = f"{first} does not exist, but {copies[there[0]]} does"  # Some captures are shared smaller.
+        raise InputError(f"{told}: end the command with `nerfstudio-data --downscale-factor {there[0]}`.")
+    factor = factor or images.automatic_factor(first, lambda by: folder / f"images_{by}" / first.name)
+    for kind, key in (("images", "file_path"), ("masks", "mask_path")):
+        if factor > 1 and key in described[0] and not (smaller := folder / f"{kind}_{factor}").is_dir():
+            told = f"{smaller} does not exist, which should hold the {kind} scaled down by {factor}"
+            scale = f"--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}"
+            raise InputError(
+                f"{told}: make it, or end the command with `{scale} nerfstudio-data --downscale-factor 1`."
+            )
+    return factor
+
+
 @collect_findings
 def check_blender(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a synthetic scene in NeRF's layout, `transforms_train.json` and its siblings, and its images if asked."""
@@ -81,8 +95,8 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
             yield warning(f"{path} does not exist: `ns-eval` will have nothing to measure.")
             continue
         described = (meta := read_blender(path))["frames"]
-        images = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
-        size = image_size(images[0])  # The cameras have no size of their own.
+        paths = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
+        size = images.image_size(paths[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
         focal = _focal_length(meta, width, "camera_angle_x", str(path))
         taken = {"fl_x": focal, "fl_y": focal, "cx": width / 2, "cy": height / 2, **dict.fromkeys(_DISTORTION, 0)}
@@ -93,7 +107,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         camera = geometry.Camera(width, height, focal, focal, width / 2, height / 2)
         views = [
             view_of(frame, f"{path}: frame {frame['file_path']}", camera, image if open_images else None)
-            for frame, image in zip(described, images, strict=True)
+            for frame, image in zip(described, paths, strict=True)
         ]
         if split == "train":
             sound = yield from geometry.check_views(views, len(views), path)
@@ -108,7 +122,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         else:
             yield from geometry.check_rotations(views)
         if open_images:
-            yield from check_images([Frame(image, size if any(size) else None) for image in images], path)
+            yield from check_images([Frame(image, size if any(size) else None) for image in paths], path)
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
@@ -136,7 +150,7 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
     files = {n: mended_name(path.parent, frame[n]) for n in _FILES if n in frame}
     has_focal = not frame.keys().isdisjoint(("fl_x", "camera_angle_x"))  # Then no shared one is of this frame.
     values = {n: meta[n] for n in meta if not (has_focal and n.startswith(("fl_", "camera_angle_")))} | frame
-    if not values.keys() >= {"w", "h"} and any(size := image_size(path.parent / files["file_path"])):
+    if not values.keys() >= {"w", "h"} and any(size := images.image_size(path.parent / files["file_path"])):
         values = {"w": size[0], "h": size[1], **values}
     for side, focal, center, angle in (("w", "fl_x", "cx", "camera_angle_x"), ("h", "fl_y", "cy", "camera_angle_y")):
         if side in values:
@@ -214,8 +228,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def frames_of(meta: dict[str, Any], path: Path) -> list[dict[str, Any]]:
     """Return the frames; raise InputError if there are none, or one has no usable file path and pose."""
-    frames = meta.get("frames")
-    if not isinstance(frames, list) or not frames:
+    if not isinstance(frames := meta.get("frames"), list) or not frames:
         raise InputError(f"{path} lists no frames, so there is no image to train on: {GIVE_POSES}.")
     for number, frame in enumerate(frames):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
