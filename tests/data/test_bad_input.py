@@ -690,7 +690,7 @@ NERFSTUDIO = {
 BLENDER = {
     "blender-no-val": (
         lambda data: [remove(f"transforms_{split}.json")(data) for split in ("val", "test")],
-        r"\S+/transforms_val\.json does not exist: restore it.*",
+        r"\S+/transforms_val\.json does not exist, nor a transforms_test\.json: rename .*\.",
     ),
     "blender-nan": (meta(set_pose(0, 1, 3, np.inf), "transforms_train.json"), r"\S+: frame \S+ has NaN or inf.*"),
     "blender-mirrored": (

@@ -152,6 +152,50 @@ def test_names_of_masks_are_mended_as_those_of_images(name: str, write: Callable
 
 
 @pytest.mark.hard_case(
+    "a folder `masks`, or a PLY, beside a `transforms.json` that names neither",
+    "a warning: name them there; they were left out in silence",
+)
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("masks/000.png", "holds masks that are not used, as {path} names none: name each as mask_path of its frame"),
+        ("sparse_pc.ply", "training will start from random points, not from {file}, unless you name it there."),
+    ],
+)
+def test_what_lies_beside_a_transforms_json_unnamed_is_told(name: str, told: str, write: Callable[..., Path]):
+    data = write()
+    (data / name).parent.mkdir(exist_ok=True)
+    (data / name).touch()
+    (warning,) = [finding.sentence for finding in check_data(data) if finding.severity == "warning"]
+    assert told.format(path=data / "transforms.json", file=data / name) in warning
+
+
+@pytest.mark.hard_case(
+    "a Blender scene of D-NeRF, whose frames have a `time`", "trains as one moment, with a warning; it did in silence"
+)
+def test_a_scene_that_moves_is_told(write: Callable[..., Path]):
+    data = write(of_frame=lambda frame: frame.update(time=0.5), kind="blender")
+    (warning,) = [finding.sentence for finding in check_data(data) if finding.severity == "warning"]
+    assert warning.startswith(f"{data}/transforms_train.json gives each frame a time, as of a scene that moves, and ")
+
+
+@pytest.mark.hard_case(
+    "a Blender scene with the training views' file alone, as BlenderNeRF may write it",
+    "refused: rename it to `transforms.json`, which trains",
+)
+def test_a_blender_scene_of_training_views_alone_is_read_of_a_transforms_json(write: Callable[..., Path]):
+    data = write(kind="blender")
+    for split in ("val", "test"):
+        (data / f"transforms_{split}.json").unlink()
+    assert errors(data) == [
+        f"{data}/transforms_val.json does not exist, nor a transforms_test.json: rename transforms_train.json to "
+        "transforms.json, of which some are held out."
+    ]
+    (data / "transforms_train.json").rename(data / "transforms.json")
+    assert errors(data) == []
+
+
+@pytest.mark.hard_case(
     "a Blender scene whose names end in .png, or without a file of validation", "read; the names became `.png.png`"
 )
 def test_a_blender_scene_is_read_with_and_without_suffixes(write: Callable[..., Path], captures: Path):

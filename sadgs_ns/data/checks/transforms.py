@@ -62,6 +62,9 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     sound = yield from geometry.check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
         yield note(f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
+    if not any("mask_path" in frame for frame in described) and images.images_in(folder / "masks"):
+        remedy = "name each as mask_path of its frame to leave out what is black in it"
+        yield warning(f"{folder / 'masks'} holds masks that are not used, as {path} names none: {remedy}.")
     if open_images:
         yield from check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
@@ -80,9 +83,8 @@ def _factor_of(described: Sequence[dict[str, Any]], folder: Path, options: Parse
         if factor > 1 and key in described[0] and not (smaller := folder / f"{kind}_{factor}").is_dir():
             told = f"{smaller} does not exist, which should hold the {kind} scaled down by {factor}"
             scale = f"--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}"
-            raise InputError(
-                f"{told}: make it, or end the command with `{scale} nerfstudio-data --downscale-factor 1`."
-            )
+            words = f"{scale} nerfstudio-data --downscale-factor 1"
+            raise InputError(f"{told}: make it, or end the command with `{words}`.")
     return factor
 
 
@@ -94,7 +96,13 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         if split == "test" and not path.is_file():
             yield warning(f"{path} does not exist: `ns-eval` will have nothing to measure.")
             continue
+        if split == "val" and not path.exists() and not path.with_name("transforms_test.json").exists():
+            told = f"{path} does not exist, nor a transforms_test.json"
+            raise InputError(f"{told}: rename transforms_train.json to transforms.json, of which some are held out.")
         described = (meta := read_blender(path))["frames"]
+        if "time" in described[0] and split == "train":
+            told = f"{path} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
+            yield warning(f"{told}: what moves will blur; if it shall not, keep the frames of one time.")
         paths = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
         size = images.image_size(paths[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
@@ -284,4 +292,6 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[geometry.View])
         random = "end the command with `nerfstudio-data --load-3D-points False` to start from random points"
         yield from geometry.check_points(points, views, source, f"run COLMAP's mapper again, or {random}")
     else:
-        yield note(f"{path} has no ply_file_path: training will start from random points.")
+        told = f"{path} has no ply_file_path: training will start from random points"
+        found = min(path.parent.glob("*.ply"), default=None)
+        yield warning(f"{told}, not from {found}, unless you name it there.") if found else note(f"{told}.")
