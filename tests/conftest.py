@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,6 +90,16 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(trylast=True)  # after all fixtures
 def pytest_runtest_teardown() -> None:
     assert torch.get_num_threads() == THREADS, "every later test of this process would compute with other threads"
+    close_loggers()
+
+
+def close_loggers() -> None:
+    """Take away the loggers of the test's runs, to which all later runs of this process would write, too."""
+    if (writer := sys.modules.get("nerfstudio.utils.writer")) is not None:
+        for logger in writer.EVENT_WRITERS:
+            if hasattr(logger, "tb_writer"):
+                logger.tb_writer.close()  # which has a thread and a file
+        writer.EVENT_WRITERS.clear()
 
 
 @pytest.fixture(scope="session")
