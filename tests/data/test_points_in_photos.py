@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,15 +41,23 @@ def layout(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drawn scene, to be read only."""
+    folder = tmp_path_factory.mktemp("room") / "scene"
+    write_scene(folder, 96, 72, 12, 1500)
+    return folder
+
+
 @pytest.fixture
-def capture(layout: str, tmp_path: Path) -> Callable[..., Path]:
+def capture(layout: str, room: Path, tmp_path: Path) -> Callable[..., Path]:
     """Writes a drawn scene in a layout, after a change of its points and one of its photos."""
 
     def write(
         change: Callable[[pycolmap.Point3D], None] = lambda point: None,
         repaint: Callable[[list[Path]], None] = lambda photos: None,
     ) -> Path:
-        write_scene(tmp_path, 96, 72, 12, 1500)
+        shutil.copytree(room, tmp_path, dirs_exist_ok=True)
         model = pycolmap.Reconstruction(tmp_path / SPARSE_FOLDER)
         for point in model.points3D.values():
             change(point)
