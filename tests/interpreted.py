@@ -40,3 +40,5 @@ def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES"), (projection, "_LANES")]
     for module, name in lanes:
         monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.
+    monkeypatch.setattr(tiles, "_ORDER_LANES", 8192)
+    monkeypatch.setattr(tiles, "_PROGRAMS", 1)

@@ -54,7 +54,8 @@ def write_mesh(
     views = render_depths(params, cameras, range(number), drawing)
     for view in track(views, "Fusing depth", number, console=console, disable=not console.is_terminal):
         fusion.add(view)
-    if not len((found := fusion.mesh()).triangles):
+    found = fusion.mesh()
+    if not len(found.triangles):
         problem = f"No surface came out of {number} training views with voxels of {voxel_size:.3g}"
         raise InputError(f"{problem}: take fewer Gaussians away, or leave --voxel-size out.")
     with atomic_path(path) as partial, partial.open("wb") as file:

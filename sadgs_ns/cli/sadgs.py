@@ -314,7 +314,8 @@ class PhotosToSplat:
         command += ["--timestamp", self._run.name, "--vis", "tensorboard" if measures else "none"]  # for the measures
         command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{self.options.effort:g}"]
         command += ["--load-dir", str(self._run.absolute())] if begun else []
-        self.call(self._trainer or self.worker("training", _TRAINING), line, on_event, [*command, *self.train_options])
+        worker = self._trainer or self.worker("training", _TRAINING)
+        self.call(worker, line, on_event, [*command, *self.train_options])
         if not self._checkpoint():
             raise RunError(f"training ended without a checkpoint; all that it printed is in {self.folder}/log.")
         told = f"{total} iterations, {count} Gaussians"

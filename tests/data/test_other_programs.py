@@ -189,7 +189,7 @@ def test_a_blender_scene_of_training_views_alone_is_read_of_a_transforms_json(wr
         (data / f"transforms_{split}.json").unlink()
     assert errors(data) == [
         f"{data}/transforms_val.json does not exist, nor a transforms_test.json: rename transforms_train.json to "
-        "transforms.json, of which some are held out."
+        "transforms.json, and some views are held out."
     ]
     (data / "transforms_train.json").rename(data / "transforms.json")
     assert errors(data) == []

@@ -172,7 +172,8 @@ def _is_swept(path: Path) -> bool:
     """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
     with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
         is_whole, lens = image.width == 2 * image.height, Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
-        return not is_whole and (lens.get(ExifTags.Base.CustomRendered) == 6 or b"GPano:" in image.info.get("xmp", b""))
+        by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
+        return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
     return False
 
 

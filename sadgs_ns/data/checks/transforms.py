@@ -98,11 +98,11 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
             continue
         if split == "val" and not path.exists() and not path.with_name("transforms_test.json").exists():
             told = f"{path} does not exist, nor a transforms_test.json"
-            raise InputError(f"{told}: rename transforms_train.json to transforms.json, of which some are held out.")
+            raise InputError(f"{told}: rename transforms_train.json to transforms.json, and some views are held out.")
         described = (meta := read_blender(path))["frames"]
         if "time" in described[0] and split == "train":
             told = f"{path} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
-            yield warning(f"{told}: what moves will blur; if it shall not, keep the frames of one time.")
+            yield warning(f"{told}: what moves will blur, so keep the frames of one time if you can.")
         paths = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
         size = images.image_size(paths[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
