@@ -22,8 +22,7 @@ class Finding:
 
     def __post_init__(self) -> None:
         """Escape what a damaged file's names can hold, such as a line's end."""
-        printable = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in self.sentence)
-        object.__setattr__(self, "sentence", printable)
+        object.__setattr__(self, "sentence", "".join(c if c.isprintable() else ascii(c)[1:-1] for c in self.sentence))
 
 
 fault, warning, note = (functools.partial(Finding, severity) for severity in ("error", "warning", "note"))
