@@ -195,7 +195,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
         others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
         fixed |= set(before.cameras)
     others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
-    skips_points = not fixed  # Those that hold no photo are adjusted at the end alone, which holds nothing fixed.
+    skips_points = not fixed  # Those that hold no photo wait for the last adjustment, which can hold nothing fixed.
 
     def attempt(stage: str, limits: dict[str, float]) -> pycolmap.Reconstruction | None:
         options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **others)
