@@ -67,10 +67,8 @@ def make_model(
         groups: The photos' names, those of one camera together.
         matching: Any but "auto".
         max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
-        model: The model's folder. Beside it lie `alpha` and `masks` of `write_alpha` and `write_masks`, and what an
-            interrupted run left, which is used again.
-        base: An earlier model's folder, to which photos are added; its cameras stay as they are, and the added photos
-            alone are undistorted.
+        model: The model's folder. Beside it lie `write_alpha`'s and `write_masks`' files, and what a stopped run left.
+        base: An earlier model's folder, to which photos are added; these alone are undistorted, and its cameras stay.
         rigs: The names of the views of each panorama.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import filecmp
 import os
 import shlex
 import sys
@@ -78,7 +79,7 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
             raise InputError(f"{problem}, or end the command with {words}, or --downscale-factor 4 for images_4.")
     for other, others in layouts.find_reconstructions(data).items():
         twin = data / other / poses.name  # The same file, as in a copy, is no other model.
-        differs = len(others) == len(names) and twin.is_file() and twin.read_bytes() != poses.read_bytes()
+        differs = len(others) == len(names) and twin.is_file() and not filecmp.cmp(twin, poses, shallow=False)
         if len(others) > len(names) or differs:
             problem = f"{poses} has {len(names)} images, {data / other} has {len(others)}"
             words = _words(data, dataclasses.replace(options, colmap_path=other), others)

@@ -20,8 +20,7 @@ class Finding:
     severity: Literal["error", "warning", "note"]  # Training is refused, may disappoint, or is worth a remark
     sentence: str  # A sentence that names the file and the remedy
 
-    def __post_init__(self) -> None:
-        """Escape what a damaged file's names can hold, such as a line's end."""
+    def __post_init__(self) -> None:  # A damaged file's names can hold a line's end.
         object.__setattr__(self, "sentence", "".join(c if c.isprintable() else ascii(c)[1:-1] for c in self.sentence))
 
 

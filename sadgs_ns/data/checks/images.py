@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import math
 import os
 from collections import Counter, defaultdict
@@ -121,10 +120,7 @@ def check_images(frames: Sequence[Frame], source: Path, look_for_unused: bool = 
     if twice := [image for image, poses in Counter(frame.image for frame in frames).items() if poses > 1]:
         told = f"{source} has more than one pose of {and_more(twice[0], len(twice))}"
         yield fault(f"{told}: keep one, or give each an image of its own.")
-    # Unlike Path.resolve, realpath does not raise where links form a loop.
-    used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
-    beside = itertools.chain(*map(images_in, sorted({frame.image.parent for frame in frames})))
-    if look_for_unused and (unused := [path for path in beside if os.path.realpath(path) not in used]):
+    if look_for_unused and (unused := _unused_images(frames)):
         where = and_more(unused[0], len(unused))
         yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
     if problems:
@@ -194,6 +190,13 @@ def _describe(source: Path, images: Sequence[_Image], masks: Sequence[_Image | N
         half = "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution"
         text += f" Images of more than {MAX_AUTO_RESOLUTION} px take long: {half}."
     return text
+
+
+def _unused_images(frames: Sequence[Frame]) -> list[Path]:
+    # Unlike Path.resolve, realpath does not raise where links form a loop.
+    used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
+    folders = sorted({frame.image.parent for frame in frames})
+    return [path for folder in folders for path in images_in(folder) if os.path.realpath(path) not in used]
 
 
 def images_in(folder: Path) -> list[Path]:

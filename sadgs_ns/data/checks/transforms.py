@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from sadgs_ns.data import IMAGE_SUFFIXES, colmap
 from sadgs_ns.data.checks import geometry, images
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
-from sadgs_ns.data.checks.images import Frame, check_images, scaled_size
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
@@ -49,9 +48,10 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     for frame in described:
         where, mask = f"{path}: frame {frame['file_path']}", frame.get("mask_path")
         geometry.check_positive(frame, where, _PINHOLE)
-        size, image = scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor"), locate(frame["file_path"])
+        image = locate(frame["file_path"])
+        size = images.scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor")
         views.append(view_of(frame, where, _camera(frame, model, where), image if open_images else None))
-        frames.append(Frame(image, size, None if mask is None else locate(mask, "masks")))
+        frames.append(images.Frame(image, size, None if mask is None else locate(mask, "masks")))
     for name, what in (("mask_path", "masks"), ("depth_file_path", "depths")):
         if 0 < (having := sum(name in frame for frame in described)) < len(frames):
             problem = f"{path} names {what} for {having} of {len(frames)} frames"
@@ -66,25 +66,24 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         remedy = "name each as mask_path of its frame to leave out what is black in it"
         yield warning(f"{folder / 'masks'} holds masks that are not used, as {path} names none: {remedy}.")
     if open_images:
-        yield from check_images(frames, path, look_for_unused=factor == 1)
+        yield from images.check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
         yield from _check_ply(meta, path, views if sound else [])
 
 
 def _factor_of(described: Sequence[dict[str, Any]], folder: Path, options: ParserOptions) -> int:
     """Return the downscale factor of the frames' images to read; raise InputError if these or masks are missing."""
-    first, factor = folder / described[0]["file_path"], options.downscale_factor
-    copies = {by: folder / f"images_{by}" / first.name for by in (2, 4, 8)}
-    if factor is None and not first.is_file() and (there := [by for by in copies if copies[by].is_file()]):
-        told = f"{first} does not exist, but {copies[there[0]]} does"  # Some captures are shared smaller.
+    first = folder / described[0]["file_path"]
+    factor, copies = options.downscale_factor, lambda by: images.smaller_folder(folder / "images", by) / first.name
+    if factor is None and not first.is_file() and (there := [by for by in (2, 4, 8) if copies(by).is_file()]):
+        told = f"{first} does not exist, but {copies(there[0])} does"  # Some captures are shared smaller.
         raise InputError(f"{told}: end the command with `nerfstudio-data --downscale-factor {there[0]}`.")
-    factor = factor or images.automatic_factor(first, lambda by: folder / f"images_{by}" / first.name)
+    factor = factor or images.automatic_factor(first, copies)
     for kind, key in (("images", "file_path"), ("masks", "mask_path")):
-        if factor > 1 and key in described[0] and not (smaller := folder / f"{kind}_{factor}").is_dir():
-            told = f"{smaller} does not exist, which should hold the {kind} scaled down by {factor}"
+        if factor > 1 and key in described[0] and not (where := images.smaller_folder(folder / kind, factor)).is_dir():
+            told = f"{where} does not exist, which should hold the {kind} scaled down by {factor}: make it"
             scale = f"--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}"
-            words = f"{scale} nerfstudio-data --downscale-factor 1"
-            raise InputError(f"{told}: make it, or end the command with `{words}`.")
+            raise InputError(f"{told}, or end the command with `{scale} nerfstudio-data --downscale-factor 1`.")
     return factor
 
 
@@ -130,7 +129,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         else:
             yield from geometry.check_rotations(views)
         if open_images:
-            yield from check_images([Frame(image, size if any(size) else None) for image in paths], path)
+            yield from images.check_images([images.Frame(image, size if any(size) else None) for image in paths], path)
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
