@@ -2,7 +2,7 @@
 
 Nothing stands where somebody walked with a camera. A faint Gaussian that floats there becomes haze over the whole image
 of a view beside the path. Viewers of exported files show it, too, because they also draw what is nearer than the run's
-near plane. Real surfaces near a path have SfM points.
+near plane. Real surfaces near a path have SfM points, and look small from it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-REACH = 1.5  # Reach of the empty space around a path, in near planes; 2 cost a view 2.6 dB (docs/results.md)
-FEW_VIEWS, REACH_OF_MANY = 60, 1.0  # The reach with more than 60 training views is 1; 1.5 would cost site .2 dB
-HAZE_ANGLE = 0.1  # Haze is longer, in standard deviations, than this share of its distance from a path; .2 left some
-SUPPORT = 2.0  # A Gaussian is of a surface if a point to start from lies within this many of its standard deviations
+REACH = 1.5  # Reach of the empty space around a path, in near planes; 1 left some of room, and 2 cost a view 2.6 dB
+# Shares of a Gaussian's distance from a path:
+HAZE_LENGTH = 0.1  # Haze is longer, in standard deviations; .2 left some
+SUPPORT = 0.4  # The nearest point to start from lies farther from haze; needles among leaves reach points twice as far
+TOO_WIDE = 0.4  # Or haze's second axis is longer, in standard deviations: nobody stands in a surface with a camera
 NEIGHBOURS = 4  # Each camera has paths to this many others: the nearest ones that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
 SAME_PLACE = 5e-4  # Share of the reach within which cameras stand in one place, such as the parts of a panorama
@@ -45,7 +46,7 @@ class CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         rotations = viewmats[:, :3, :3].double().cpu()
         centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
-        reach = near_plane * (REACH if len(centres) <= FEW_VIEWS else REACH_OF_MANY)
+        reach = REACH * near_plane
         distances = torch.cdist(centres, centres)
         unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
         nearest = distances.masked_fill_(unlike | (distances < SAME_PLACE * reach), torch.inf).fill_diagonal_(torch.inf)
@@ -56,7 +57,7 @@ class CameraPaths:
         pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
         # `haze` looks at no point farther away.
-        return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + 2 * SUPPORT) * reach)[0] > 0])
+        return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + SUPPORT) * reach)[0] > 0])
 
     @cached_property
     def surfaces(self) -> KDTree:
@@ -70,7 +71,8 @@ class CameraPaths:
         scales: Tensor,  # [N, 3]
     ) -> Tensor:
         """Tell which Gaussians are haze near a path; one whose centre is not finite is not. bool [N]"""
-        haze, sizes = torch.zeros_like(means[:, 0], dtype=torch.bool), scales.amax(dim=1)
+        lengths = scales.sort(dim=1).values  # [N, 3]
+        from_path = torch.full_like(means[:, 0], torch.inf)  # [N]
         counts, firsts, listed = _near(means, self.starts, self.ends, self.reach)
         most = int(counts.max()) if len(counts) else 0
         for part in counts.nonzero()[:, 0].split(_PAIRS // max(most, 1) + 1):
@@ -78,10 +80,12 @@ class CameraPaths:
             before = (counts[part].cumsum(dim=0) - counts[part]).repeat_interleave(counts[part])  # [K]
             paths = listed[firsts[which] + torch.arange(len(which), device=which.device) - before]
             distances = _distances(means[which], self.starts[paths], self.ends[paths])
-            haze[which[(distances < self.reach) & (sizes[which] > HAZE_ANGLE * distances)]] = True
+            from_path.scatter_reduce_(0, which, distances, "amin")
+        haze = (from_path < self.reach) & (lengths[:, 2] > HAZE_LENGTH * from_path)
         found = haze.nonzero()[:, 0]
         ways, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
-        haze[found] = torch.from_numpy(ways).to(sizes) > SUPPORT * sizes[found].clamp_max(2 * self.reach)
+        alone = torch.from_numpy(ways).to(means) > SUPPORT * from_path[found]
+        haze[found] = alone | (lengths[found, 1] > TOO_WIDE * from_path[found])
         return haze
 
 

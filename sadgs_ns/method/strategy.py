@@ -272,7 +272,7 @@ class StructureAwareStrategy(Strategy):
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
     def _prune_faint(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
-        """Remove haze, Gaussians less opaque than this, and `others`; return how many were removed."""
+        """Remove haze, Gaussians less opaque than this, and others; return how many were removed."""
         gone = opacities(params) < opacity
         if (paths := state.get("camera_paths")) is not None:
             gone |= paths.haze(params["means"].detach(), params["scales"].detach().exp())

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.camera_paths import FEW_VIEWS, HAZE_ANGLE, REACH, REACH_OF_MANY, SUPPORT, CameraPaths
+from sadgs_ns.method.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
 NEAR = 2.0
@@ -36,12 +36,13 @@ def reference(paths: CameraPaths, points: Tensor, means: Tensor, scales: Tensor)
     """`CameraPaths.haze` in float64, Gaussian by Gaussian and path by path."""
     found, points, starts = [], points.double(), paths.starts.double()
     ways = paths.ends.double() - starts
-    for mean, scale in zip(means.double(), scales.double().amax(dim=1).tolist(), strict=True):
+    for mean, axes in zip(means.double(), scales.double(), strict=True):
+        _, width, length = sorted(axes.tolist())
         along = ((mean - starts) * ways).sum(dim=1) / ways.square().sum(dim=1).clamp_min(1e-300)
         distance = float((mean - starts - along.clamp(0, 1)[:, None] * ways).norm(dim=1).min())
-        support = SUPPORT * min(scale, 2 * paths.reach)
-        alone = float((points - mean).norm(dim=1).min()) > support
-        found.append(distance < paths.reach and scale > HAZE_ANGLE * distance and alone)
+        alone = float((points - mean).norm(dim=1).min()) > SUPPORT * distance
+        unlike_surface = alone or width > TOO_WIDE * distance
+        found.append(distance < paths.reach and length > HAZE_LENGTH * distance and unlike_surface)
     return torch.tensor(found)
 
 
@@ -68,15 +69,26 @@ def test_gaussians_of_surfaces_stay_however_near_the_path_leads_them():
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, 2, 3] = -6.0
     paths = CameraPaths.of(viewmats, NEAR, wall(3.0))  # The path leads through the wall.
-    assert haze(paths, (0.1, 0.1, 3.1), (0.1, 0.1, 2.4), (0.1, 0.1, 1.0)) == [False, False, True]
+    assert haze(paths, (1.0, 1.0, 3.1), (1.0, 1.0, 2.7), (1.0, 1.0, 1.0)) == [False, False, True]
     beside = wall(0.0)[:, [0, 2, 1]] + torch.tensor([0.0, -1.0, 0.0])
     paths = CameraPaths.of(row_of_cameras(), NEAR, beside)
-    assert haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5)) == [False, True]
+    assert haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5), scale=0.4) == [False, True]
 
 
-@pytest.mark.parametrize(("views", "width"), [(8, 9.0), (500, 6.0)])
+@pytest.mark.hard_case(
+    "needles among leaves that reach the leaves' SfM points, and faint discs before a camera at a wall",
+    "pruned: the points lie no nearer to them than they do to the camera, or the discs look too wide from there",
+)
+def test_haze_near_surfaces_is_found():
+    paths = CameraPaths.of(row_of_cameras(), NEAR, torch.tensor([[3.0, 0.0, 1.5], [3.0, -1.0, 0.0]]))
+    means = torch.tensor([[3.0, 0.0, 1.0], [3.0, 0.0, 1.4], [3.0, -0.9, 0.0], [3.0, -0.9, 0.0]])
+    scales = torch.tensor([[0.02, 0.1, 0.8], [0.02, 0.1, 0.8], [0.8, 0.5, 0.02], [0.8, 0.3, 0.02]])
+    assert paths.haze(means, scales).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(("views", "width", "near"), [(8, 9.0, NEAR), (500, 6.0, NEAR / REACH)])
 def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
-    views: int, width: float, monkeypatch: pytest.MonkeyPatch
+    views: int, width: float, near: float, monkeypatch: pytest.MonkeyPatch
 ):
     generator = torch.Generator().manual_seed(0)
     viewmats = row_of_cameras(views)
@@ -86,12 +98,12 @@ def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
     points -= torch.tensor([8.0, 15.0, 15.0])
     means = (torch.rand((3000, 3), generator=generator) - 0.5) * size + torch.tensor([views - 1.0, 0.0, 0.0])
     scales = 10 ** (2 * torch.rand((3000, 3), generator=generator) - 1.5)
-    paths = CameraPaths.of(viewmats, NEAR, points)
+    paths = CameraPaths.of(viewmats, near, points)
     numbers, addcmul = [], torch.addcmul
     monkeypatch.setattr(torch, "addcmul", lambda a, *b, **c: (numbers.append(a.numel()), addcmul(a, *b, **c))[1])
     found, expected = paths.haze(means, scales), reference(paths, points, means, scales)
-    assert torch.equal(found, expected) and 300 < int(expected.sum()) < 1500
-    if views > FEW_VIEWS:
+    assert torch.equal(found, expected) and 300 < int(expected.sum()) < 2500
+    if views > 100:
         assert sum(numbers) < 0.1 * 3 * len(means) * len(paths.starts), "runs of thousands of views would wait for it"
 
 
@@ -138,11 +150,6 @@ def test_no_path_leads_to_cameras_that_are_far_away(distance: float, between: bo
     assert haze(CameraPaths.of(viewmats, NEAR, wall(-8.0)), (2.0, 0.0, distance / 2)) == [between]
     apart = row_of_cameras(3, spacing=distance)  # Cameras that all stand far apart are neighbours.
     assert haze(CameraPaths.of(apart, NEAR, wall(-8.0)), (distance / 2, 0.0, 0.5)) == [True]
-
-
-def test_the_space_around_the_paths_of_many_cameras_is_narrower():
-    reaches = [CameraPaths.of(row_of_cameras(n), NEAR, wall(8.0)).reach for n in (FEW_VIEWS, FEW_VIEWS + 1)]
-    assert reaches == [REACH * NEAR, REACH_OF_MANY * NEAR] and reaches[1] < reaches[0]
 
 
 @pytest.mark.parametrize("points", [0, 3])
