@@ -16,10 +16,9 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 REACH = 1.5  # Reach of the empty space around a path, in near planes; 1 left some of room, and 2 cost a view 2.6 dB
-# Shares of a Gaussian's distance from a path:
-HAZE_LENGTH = 0.1  # Haze is longer, in standard deviations; .2 left some
-SUPPORT = 0.4  # The nearest point to start from lies farther from haze; needles among leaves reach points twice as far
-TOO_WIDE = 0.4  # Or haze's second axis is longer, in standard deviations: nobody stands in a surface with a camera
+HAZE_LENGTH = 0.1  # Haze is longer, in standard deviations, than this share of its distance from a path; .2 left some
+SUPPORT = 0.4  # And no point to start from lies within this share of it: needles among leaves reach points twice as far
+TOO_WIDE = 0.4  # Or its second axis is longer than this share: nobody stands so near a surface with a camera
 NEIGHBOURS = 4  # Each camera has paths to this many others: the nearest ones that look in a similar direction
 SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
 SAME_PLACE = 5e-4  # Share of the reach within which cameras stand in one place, such as the parts of a panorama
@@ -71,7 +70,6 @@ class CameraPaths:
         scales: Tensor,  # [N, 3]
     ) -> Tensor:
         """Tell which Gaussians are haze near a path; one whose centre is not finite is not. bool [N]"""
-        lengths = scales.sort(dim=1).values  # [N, 3]
         from_path = torch.full_like(means[:, 0], torch.inf)  # [N]
         counts, firsts, listed = _near(means, self.starts, self.ends, self.reach)
         most = int(counts.max()) if len(counts) else 0
@@ -81,11 +79,11 @@ class CameraPaths:
             paths = listed[firsts[which] + torch.arange(len(which), device=which.device) - before]
             distances = _distances(means[which], self.starts[paths], self.ends[paths])
             from_path.scatter_reduce_(0, which, distances, "amin")
-        haze = (from_path < self.reach) & (lengths[:, 2] > HAZE_LENGTH * from_path)
+        haze = (from_path < self.reach) & (scales.amax(dim=1) > HAZE_LENGTH * from_path)
         found = haze.nonzero()[:, 0]
         ways, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
         alone = torch.from_numpy(ways).to(means) > SUPPORT * from_path[found]
-        haze[found] = alone | (lengths[found, 1] > TOO_WIDE * from_path[found])
+        haze[found] = alone | (scales[found].median(dim=1).values > TOO_WIDE * from_path[found])
         return haze
 
 

@@ -41,14 +41,8 @@ _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
     "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
 )
-_ANOTHER_ENDED = "Another process of the run ended, and this one with it"
-_NOTHING_DONE = "stopped before an iteration was done; the same command starts again."
+_NOTHING_DONE = "stopped before an iteration was done; the same command starts again"
 _SAVING_SHARE = 0.01  # Saving may take at most this share of the time between two checkpoints by the clock
-
-
-def _memory(error: torch.cuda.OutOfMemoryError) -> str:
-    """Return the first two of torch's many sentences: how much memory was asked for, on which device."""
-    return ". ".join(reason(error).split(". ")[:2]).rstrip(".")
 
 
 class SadgsTrainer(Trainer):
@@ -100,15 +94,21 @@ class SadgsTrainer(Trainer):
             known = self.world.alone and model.backend == "triton" and model.tile_forecast is not None
             if self.config.cuda_graphs and known and model.camera_optimizer.config.mode == "off":
                 self.graphed = GraphedSteps(model)
-        except torch.cuda.OutOfMemoryError as error:
-            raise RunError(f"The GPU's memory is too small to start ({_memory(error)}): {_LESS_MEMORY}.") from error
         except RuntimeError as error:
-            if isinstance(error, RunError) or self._peers is None or not self._peers.ended():
-                raise
-            raise RunError(f"{_ANOTHER_ENDED}: {_NOTHING_DONE}") from error
+            self._explain(error, "is too small to start", _NOTHING_DONE)
+            raise
         except KeyboardInterrupt:
-            note(f"SIGINT: {_NOTHING_DONE}")
+            note(f"SIGINT: {_NOTHING_DONE}.")
             raise SystemExit(128 + signal.SIGINT) from None
+
+    def _explain(self, error: RuntimeError, full: str, kept: str) -> None:
+        """Raise RunError instead of an error of full memory, or one that another process had first."""
+        if isinstance(error, torch.cuda.OutOfMemoryError):
+            asked_for = ". ".join(reason(error).split(". ")[:2]).rstrip(".")  # Torch has many more sentences.
+            remedy = _LESS_MEMORY if kept == _NOTHING_DONE else f"{_LESS_MEMORY}; {kept}"
+            raise RunError(f"The GPU's memory {full} ({asked_for}): {remedy}.") from error
+        if not isinstance(error, RunError) and self._peers is not None and self._peers.ended():
+            raise RunError(f"Another process of the run ended, and this one with it: {kept}.") from error
 
     def _print_next_commands(self) -> None:
         """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
@@ -173,13 +173,10 @@ class SadgsTrainer(Trainer):
             self._train_until_interrupted(total)
         except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
             raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
-        except torch.cuda.OutOfMemoryError as error:
-            full = f"The GPU's memory was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
-            raise RunError(f"{full} ({_memory(error)}): {_LESS_MEMORY}; {self._resume}.") from error
         except RuntimeError as error:
-            if isinstance(error, RunError) or self._peers is None or not self._peers.ended():
-                raise
-            raise RunError(f"{_ANOTHER_ENDED}: {self._resume}.") from error
+            gaussians = self.pipeline.model.num_points
+            self._explain(error, f"was full at iteration {self.step} with {gaussians} Gaussians", self._resume)
+            raise
         finally:
             self.config.max_num_iterations = total
             self.pipeline.views.close()
@@ -279,7 +276,7 @@ class SadgsTrainer(Trainer):
         if done >= total:
             return
         if done == self._start_step:
-            text = f"{interrupted}: {_NOTHING_DONE}"
+            text = f"{interrupted}: {_NOTHING_DONE}."
         else:
             # With --load-config nerfstudio takes all options from this file.
             config = copy.copy(self.config)
