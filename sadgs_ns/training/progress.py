@@ -21,7 +21,7 @@ from sadgs_ns.events import report
 
 COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iteration": 11, "Time left": 10}
 """Columns of the table and their widths, which fit a terminal of 80 characters."""
-ITERATION_SHARES, TIME_SHARES = (0.0, 0.2, 0.5, 0.6, 1.0), (0.0, 0.17, 0.6, 0.7, 1.0)
+ITERATION_SHARES, TIME_SHARES = (0.0, 0.2, 0.533, 0.75, 1.0), (0.0, 0.15, 0.668, 0.817, 1.0)
 """Shares of a run's iterations, and of its time that they take: they are longest while the most Gaussians are there."""
 _MEASURED_SHARE = 0.35  # Share of a run's time after which the time left is told; sooner it would be over 30 % off.
 
@@ -49,7 +49,7 @@ def duration(seconds: float) -> str:
 def time_left(first: int, step: int, total: int, seconds: float) -> float | None:
     """Return the seconds that a run of `total` iterations has left if those after `first` until `step` took `seconds`.
 
-    None is too early to tell. It was within 30 % on eight captures (docs/results.md).
+    None is too early to tell. It was within 30 % on eight captures, on two hosts each (docs/results.md).
     """
     before, done = np.interp([(first + 1) / total, (step + 1) / total], ITERATION_SHARES, TIME_SHARES)
     return None if done - before < _MEASURED_SHARE else float(seconds * (1 - done) / (done - before))
