@@ -46,11 +46,14 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def time_left(first: int, step: int, total: int, seconds: float) -> float | None:
+def time_left(first: int, step: int, total: int, seconds: float, recent: int = 0, pace: float = 0.0) -> float | None:
     """Return the seconds that a run of `total` iterations has left if those after `first` until `step` took `seconds`.
 
-    None is too early to tell. It was within 30 % on eight captures, on two hosts each (docs/results.md).
+    Those after `recent` took `pace` each, as all do after densification. None is too early to tell. It was within 30 %
+    on eight captures, on two hosts each, and then within 20 (docs/results.md).
     """
+    if recent > ITERATION_SHARES[2] * total:
+        return pace * (total - 1 - step)
     before, done = np.interp([(first + 1) / total, (step + 1) / total], ITERATION_SHARES, TIME_SHARES)
     return None if done - before < _MEASURED_SHARE else float(seconds * (1 - done) / (done - before))
 
@@ -105,9 +108,10 @@ class ProgressTable(LocalWriter):
         self._first = self._first or self._times[0]
         total, timing = writer.GLOBAL_BUFFER["max_iter"], ["", ""]
         if step > self._times[0][0]:
-            left = time_left(self._first[0], step, total, now - self._first[1])
             pace = (now - self._times[0][1]) / (step - self._times[0][0])
-            timing = [_short(pace), "" if left is None else duration(left)]
+            left = time_left(self._first[0], step, total, now - self._first[1], self._times[0][0], pace)
+            short = f"{1000 * pace:.0f} ms" if pace < 1 else f"{pace:.1f} s"
+            timing = [short, "" if left is None else duration(left)]
         report("iteration", step=step, left=timing[1])
         self._show(_line([f"{step} ({step / total:.2%})", *cells, *timing]))
 
@@ -141,10 +145,6 @@ def _cells(events: dict[str, Any]) -> list[str]:
 
 def _line(cells: list[str]) -> str:
     return "".join(f"{cell:<{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True)).rstrip()
-
-
-def _short(seconds: float) -> str:
-    return f"{1000 * seconds:.0f} ms" if seconds < 1 else f"{seconds:.1f} s"
 
 
 def remove_tables() -> None:
