@@ -25,7 +25,7 @@ USES = {
     "": set(),
 }
 MAX_FLAT = 6
-LINES = 18_262
+LINES = 18_261
 """Most lines of Python in the package. This number and those below may only fall: what is added takes the place of
 something, and who makes the package smaller lowers them."""
 LINES_OF_A_FILE = 450

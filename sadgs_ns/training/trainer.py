@@ -95,17 +95,16 @@ class SadgsTrainer(Trainer):
             if self.config.cuda_graphs and known and model.camera_optimizer.config.mode == "off":
                 self.graphed = GraphedSteps(model)
         except RuntimeError as error:
-            self._explain(error, "is too small to start", _NOTHING_DONE)
+            self._explain(error, "is too small to start", _LESS_MEMORY, _NOTHING_DONE)
             raise
         except KeyboardInterrupt:
             note(f"SIGINT: {_NOTHING_DONE}.")
             raise SystemExit(128 + signal.SIGINT) from None
 
-    def _explain(self, error: RuntimeError, full: str, kept: str) -> None:
+    def _explain(self, error: RuntimeError, full: str, remedy: str, kept: str) -> None:
         """Raise RunError instead of an error of full memory, or one that another process had first."""
         if isinstance(error, torch.cuda.OutOfMemoryError):
             asked_for = ". ".join(reason(error).split(". ")[:2]).rstrip(".")  # Torch has many more sentences.
-            remedy = _LESS_MEMORY if kept == _NOTHING_DONE else f"{_LESS_MEMORY}; {kept}"
             raise RunError(f"The GPU's memory {full} ({asked_for}): {remedy}.") from error
         if not isinstance(error, RunError) and self._peers is not None and self._peers.ended():
             raise RunError(f"Another process of the run ended, and this one with it: {kept}.") from error
@@ -174,8 +173,8 @@ class SadgsTrainer(Trainer):
         except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
             raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
         except RuntimeError as error:
-            gaussians = self.pipeline.model.num_points
-            self._explain(error, f"was full at iteration {self.step} with {gaussians} Gaussians", self._resume)
+            full = f"was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
+            self._explain(error, full, f"{_LESS_MEMORY}; {self._resume}", self._resume)
             raise
         finally:
             self.config.max_num_iterations = total
