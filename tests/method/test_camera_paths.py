@@ -63,13 +63,14 @@ def test_what_floats_on_the_cameras_paths_is_haze_and_nothing_else_is():
 
 @pytest.mark.hard_case(
     "a wall between two rooms with cameras on both sides, and a wall beside the camera",
-    "their Gaussians stay, because points to start from lie near them",
+    "their Gaussians stay, because points to start from lie near them, but for those right where a path leads through",
 )
 def test_gaussians_of_surfaces_stay_however_near_the_path_leads_them():
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, 2, 3] = -6.0
     paths = CameraPaths.of(viewmats, NEAR, wall(3.0))  # The path leads through the wall.
     assert haze(paths, (1.0, 1.0, 3.1), (1.0, 1.0, 2.7), (1.0, 1.0, 1.0)) == [False, False, True]
+    assert haze(paths, (0.1, 0.1, 3.1)) == [True]
     beside = wall(0.0)[:, [0, 2, 1]] + torch.tensor([0.0, -1.0, 0.0])
     paths = CameraPaths.of(row_of_cameras(), NEAR, beside)
     assert haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5), scale=0.4) == [False, True]
@@ -102,7 +103,7 @@ def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
     numbers, addcmul = [], torch.addcmul
     monkeypatch.setattr(torch, "addcmul", lambda a, *b, **c: (numbers.append(a.numel()), addcmul(a, *b, **c))[1])
     found, expected = paths.haze(means, scales), reference(paths, points, means, scales)
-    assert torch.equal(found, expected) and 300 < int(expected.sum()) < 2500
+    assert torch.equal(found, expected) and 300 < int(expected.sum()) < 1500
     if views > 100:
         assert sum(numbers) < 0.1 * 3 * len(means) * len(paths.starts), "runs of thousands of views would wait for it"
 
