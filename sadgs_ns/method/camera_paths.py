@@ -1,4 +1,4 @@
-"""The space along the cameras' paths, which stays empty while a run densifies.
+"""The space along the cameras' paths, which training keeps empty.
 
 Nothing stands where somebody walked with a camera. A faint Gaussian that floats there becomes haze over the whole image
 of a view beside the path. Viewers of exported files show it, too, because they also draw what is nearer than the run's

@@ -124,9 +124,8 @@ class StructureAwareStrategy(Strategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """Return the state to pass to the other methods; its tensors are made at the first step.
 
-        Each structure step appends its numbers of Gaussians to the list `structure_steps`. With a `CameraPaths` under
-        `camera_paths`, each densification step prunes the haze near these, until densification ends. `scene_scale` is
-        `initialization.camera_extent`. Raises ValueError as `check`.
+        Structure steps append their numbers of Gaussians to the list `structure_steps`. Haze is pruned near the paths
+        of `camera_paths`, a `CameraPaths`. `scene_scale` is `initialization.camera_extent`. Raises as `check`.
         """
         self.check()
         return {"scene_scale": scene_scale}
@@ -168,7 +167,7 @@ class StructureAwareStrategy(Strategy):
         if step >= self.windows.refine_stop_iter:
             return
         if "n_total" not in state:
-            self._clear_statistics(params, state)
+            state.update(empty_state(len(params["means"]), params["means"].device))
         for view in _views(info):
             if self.needs_absgrad(step):
                 keep_gradient(view["means2d"])
@@ -205,7 +204,7 @@ class StructureAwareStrategy(Strategy):
             self._grow(rule, params, optimizers, state, iteration, views)
         if iteration == windows.refine_stop_iter:
             if rule is None or rule.reads != "statistics":  # whose step has pruned
-                self._prune_faint(params, optimizers, state, FINAL_PRUNE_OPACITY)
+                self._prune(params, optimizers, state, FINAL_PRUNE_OPACITY)
             for key in empty_state(0, torch.device("cpu")):
                 state.pop(key, None)  # Neither memory nor checkpoints should hold them.
         # A reset just before the final prune would leave nothing that had time to recover.
@@ -213,6 +212,11 @@ class StructureAwareStrategy(Strategy):
             map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
         if not self.world.alone and self.densifies(step):
             rebalance(self.world, params, optimizers, state)
+
+    def prune_haze(self, params: Params, optimizers: Optimizers, state: State) -> None:
+        """Remove the haze near `camera_paths`, which also arises after the last densification step."""
+        self._prune(params, optimizers, state, 0.0)
+        rebalance(self.world, params, optimizers, state)
 
     def consistently_low(self, statistics: Mapping[str, Tensor]) -> Tensor:
         """Tell which Gaussians had a low η on all three axes in more than τ_prune of their observations. bool [N]"""
@@ -240,7 +244,7 @@ class StructureAwareStrategy(Strategy):
             n_low = int(is_low.sum())
             # The final prune comes before children are made: fainter than their parents, they would be pruned, too.
             faint = max(self.min_opacity, FINAL_PRUNE_OPACITY if iteration == self.windows.refine_stop_iter else 0.0)
-            n_pruned = self._prune_faint(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
+            n_pruned = self._prune(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
             map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
         proposal = rule.propose(self, params, state)
         growth, (under_cap, in_memory) = proposal.growth, self._room(params, state, views)
@@ -253,13 +257,13 @@ class StructureAwareStrategy(Strategy):
             )
         apply(proposal, allowed, params, optimizers, state)
         if by_eta:
-            self._clear_statistics(params, state)  # Those of parents say nothing about their children.
+            state.update(empty_state(len(params["means"]), params["means"].device))  # Children have none yet.
             names = ("before", "violating", "low", "split", "pruned", "after")
             of_this = (n_before, int((growth > 0).sum()), n_low, int(allowed.sum()), n_pruned, len(params["means"]))
             numbers = dict(zip(names, self.world.sums(*of_this), strict=True))
             state.setdefault("structure_steps", []).append({"iteration": iteration, **numbers})
             return
-        self._prune_faint(params, optimizers, state, self.min_opacity)
+        self._prune(params, optimizers, state, self.min_opacity)
         if rule.reads == "gradients":
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
@@ -267,29 +271,21 @@ class StructureAwareStrategy(Strategy):
         """Return how many Gaussians the cap lets be added, and how many fit in the devices' memory with such views."""
         free = free_bytes(params["means"].device)
         in_memory = affordable_growth(params, state, free, StepSize.of(views))
-        # The device with the least room bounds all, since shards are evened out.
-        in_memory = self.world.num_ranks * self.world.least(in_memory)
+        in_memory = self.world.num_ranks * self.world.least(in_memory)  # The fullest bounds all: shards are even.
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
-    def _prune_faint(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
+    def _prune(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
         """Remove haze, Gaussians less opaque than this, and others; return how many were removed."""
-        gone = opacities(params) < opacity
+        gone = opacities(params) < opacity if also is None else (opacities(params) < opacity) | also
         if (paths := state.get("camera_paths")) is not None:
             gone |= paths.haze(params["means"].detach(), params["scales"].detach().exp())
-        return self._prune(params, optimizers, state, gone if also is None else gone | also)
-
-    def _prune(self, params: Any, optimizers: Any, state: Any, mask: Tensor) -> int:
-        """Remove Gaussians, unless fewer than one for each process would be left."""
-        n_prune = int(mask.sum())
-        of_all, total = self.world.sums(n_prune, len(mask))
-        if total - of_all < self.world.num_ranks:
+        n_prune = int(gone.sum())
+        of_all, total = self.world.sums(n_prune, len(gone))
+        if total - of_all < self.world.num_ranks:  # Each process needs one.
             return 0
         if n_prune > 0:
-            remove(params, optimizers, state, mask)
+            remove(params, optimizers, state, gone)
         return n_prune
-
-    def _clear_statistics(self, params: Any, state: State) -> None:
-        state.update(empty_state(len(params["means"]), params["means"].device))
 
 
 def empty_state(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:

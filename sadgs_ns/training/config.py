@@ -82,7 +82,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
     None is 150,000 where there are 3 to 60 training views, and otherwise none."""
     clear_paths: bool = True
-    """Let each densification step prune what floats near the cameras' paths, which viewers of files show as haze."""
+    """Prune what floats near the cameras' paths, again and again; viewers of files would show it as haze."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1."""
     sh_degree: int = 3

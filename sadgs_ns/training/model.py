@@ -42,6 +42,7 @@ CAMERA_CLEARANCE = 2.0
 brought 1.7 dB on the scene `south`, elsewhere nothing (docs/results.md#why-these-defaults)."""
 NORMALS = "normals"  # Name of an output that is computed only when it is read
 LIMIT_EVERY = 25  # Iterations between limits on scales, in which an axis grows at most threefold at the presets' rates
+HAZE_EVERY = 100  # Iterations between prunes of haze after densification, the last one before averaging begins
 
 
 class SadgsModel(SplatfactoModel):
@@ -141,12 +142,15 @@ class SadgsModel(SplatfactoModel):
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
     def step_post_backward(self, step: int) -> None:
-        """Densify and limit scales if that is due, and average the parameters at the run's end."""
+        """Densify, prune haze and limit scales if that is due, and average the parameters at the run's end."""
         self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
         self.infos = []
         iterations, done = self.plan.iterations, self.step + 1
-        if done <= iterations - round(self.config.averaged_share * iterations):
+        before_mean = iterations - round(self.config.averaged_share * iterations) - done
+        if before_mean >= 0:
             self.average.clear()  # A run that is trained on may have begun to average earlier.
+            if done > self.strategy.windows.refine_stop_iter and before_mean % HAZE_EVERY == 0:
+                self.strategy.prune_haze(self.gauss_params, self.optimizers, self.strategy_state)
         else:
             self.average.add(self.gauss_params)
             if done >= iterations:

@@ -94,13 +94,14 @@ def prune_together(world: World) -> list[int]:
     """Numbers of Gaussians of this process after each of two prunings, and after the shards were evened out."""
     strategy = StructureAwareStrategy()
     strategy.world = world
-    params = {"means": torch.nn.Parameter(torch.arange(12.0).view(4, 3) + 12 * world.rank)}
-    optimizers = {"means": torch.optim.Adam(params.values())}
+    means = torch.arange(12.0).view(4, 3) + 12 * world.rank
+    params = {"means": torch.nn.Parameter(means), "opacities": torch.nn.Parameter(torch.ones(4))}
+    optimizers = {name: torch.optim.Adam([parameter]) for name, parameter in params.items()}
     faint = torch.ones(4, dtype=torch.bool)
     faint[3:] = world.rank == 0
     numbers = []
     for mask in (faint, faint if world.rank == 0 else ~faint):
-        strategy._prune(params, optimizers, {}, mask)
+        strategy._prune(params, optimizers, {}, 0.0, mask)
         numbers.append(len(params["means"]))
     rebalance(world, params, optimizers, {})
     return [*numbers, len(params["means"])]

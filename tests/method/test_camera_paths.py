@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.method.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 
 NEAR = 2.0
 """The near plane: space is empty up to 3 from the paths."""
@@ -172,8 +172,12 @@ def test_densification_steps_prune_haze_and_the_last_one_keeps_the_paths_for_a_r
     state: dict[str, Any] = strategy.initialize_state() | {
         "camera_paths": CameraPaths.of(row_of_cameras(), NEAR, wall(8.0))
     }
-    strategy._clear_statistics(params, state)
+    state.update(empty_state(3, torch.device("cpu")))
     strategy.step_post_backward(params, optimizers, state, iteration - 1, [])
     assert params["means"].tolist() == means[1:].tolist() and "camera_paths" in state
     for step in state.get("structure_steps", []):
         assert (step["before"], step["pruned"], step["after"]) == (3, 1, 2)
+    params["means"].data[0] = means[0]  # Haze that arises later
+    strategy.prune_haze(params, optimizers, state)
+    assert params["means"].tolist() == means[2:].tolist()
+    assert {len(p) for p in params.values()} == {1}

@@ -270,7 +270,7 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
 
 def test_pruning_never_leaves_nothing():
     params = random_params(5)
-    n = short()._prune(params, adam(params), {}, torch.ones(5, dtype=torch.bool))
+    n = short()._prune(params, adam(params), {}, 1.0)
     assert n == 0 and len(params["means"]) == 5
 
 

@@ -40,6 +40,7 @@ from sadgs_ns.method.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes
+from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel, load_lpips
 from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
@@ -233,6 +234,31 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
     config.load_dir, config.load_step = whole.checkpoint_dir, stop
     last = iterations - 1
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
+
+
+@pytest.mark.hard_case(
+    "haze that arises after the last densification step, where nothing else prunes",
+    "is pruned every 100 iterations, the last time just before averaging begins",
+)
+def test_haze_is_pruned_after_densification_too_but_not_while_the_run_averages(
+    monkeypatch: pytest.MonkeyPatch, colmap: ColmapDataParserConfig, tmp_path: Path
+):
+    monkeypatch.setattr(model_module, "HAZE_EVERY", 4)
+    config = configure(tmp_path, copy.deepcopy(colmap), 20, refine_start_iter=2, refine_stop_iter=6)
+    config.pipeline.model.averaged_share = 0.2  # of the iterations 17 to 20
+    arises, counts = {9, 13, 17}, [0]
+
+    def add_haze(trainer: SadgsTrainer) -> None:
+        model = trainer.pipeline.model
+        paths = model.strategy_state["camera_paths"]
+        counts.append(model.num_points)
+        if len(counts) - 1 in arises:
+            model.means.data[0] = paths.starts[0]
+            model.scales.data[0] = math.log(paths.reach)
+
+    assert is_finite(train(config, add_haze).pipeline.model)
+    gone = {i for i in range(7, 21) if counts[i] != counts[i - 1]}
+    assert gone == {12, 16} and counts[20] == counts[6] - 2
 
 
 @pytest.mark.hard_case(
