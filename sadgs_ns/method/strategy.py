@@ -124,8 +124,8 @@ class StructureAwareStrategy(Strategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """Return the state to pass to the other methods; its tensors are made at the first step.
 
-        Structure steps append their numbers of Gaussians to the list `structure_steps`. Haze is pruned near the paths
-        of `camera_paths`, a `CameraPaths`. `scene_scale` is `initialization.camera_extent`. Raises as `check`.
+        Structure steps append their numbers of Gaussians to the list `structure_steps`. Densification and `prune_haze`
+        remove haze near a `CameraPaths`, `camera_paths`. `scene_scale`: `camera_extent`. Raises ValueError as `check`.
         """
         self.check()
         return {"scene_scale": scene_scale}
@@ -210,7 +210,7 @@ class StructureAwareStrategy(Strategy):
         # A reset just before the final prune would leave nothing that had time to recover.
         elif due(iteration, windows.reset_every) and iteration <= windows.refine_stop_iter - windows.reset_every // 4:
             map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
-        if not self.world.alone and self.densifies(step):
+        if self.densifies(step):
             rebalance(self.world, params, optimizers, state)
 
     def prune_haze(self, params: Params, optimizers: Optimizers, state: State) -> None:
@@ -274,9 +274,9 @@ class StructureAwareStrategy(Strategy):
         in_memory = self.world.num_ranks * self.world.least(in_memory)  # The fullest bounds all: shards are even.
         return self.max_gaussians - self.world.sums(len(params["means"]))[0], in_memory
 
-    def _prune(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | None = None) -> int:
+    def _prune(self, params: Any, optimizers: Any, state: Any, opacity: float, also: Tensor | bool = False) -> int:
         """Remove haze, Gaussians less opaque than this, and others; return how many were removed."""
-        gone = opacities(params) < opacity if also is None else (opacities(params) < opacity) | also
+        gone = (opacities(params) < opacity) | also
         if (paths := state.get("camera_paths")) is not None:
             gone |= paths.haze(params["means"].detach(), params["scales"].detach().exp())
         n_prune = int(gone.sum())
