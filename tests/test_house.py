@@ -24,7 +24,7 @@ USES = {
     "kernels": set(),
     "": set(),
 }
-MAX_FLAT = 6
+MAX_FLAT = 9
 LINES = 18_261
 """Most lines of Python in the package. This number and those below may only fall: what is added takes the place of
 something, and who makes the package smaller lowers them."""

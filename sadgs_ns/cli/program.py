@@ -18,7 +18,7 @@ import tyro
 
 from sadgs_ns.errors import InputError, RunError, free_space, reason
 from sadgs_ns.files import atomic_path
-from sadgs_ns.training.interrupts import Interrupted
+from sadgs_ns.interrupts import Interrupted
 
 Options = TypeVar("Options")
 

@@ -31,7 +31,6 @@ from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
-from sadgs_ns.cli.worker import OnEvent, Worker, WorkerError
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
 from sadgs_ns.data.checks.layouts import find_cameras
@@ -39,8 +38,9 @@ from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
+from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 from sadgs_ns.method.schedule import MOST_EFFORT
-from sadgs_ns.training.interrupts import Interrupts, redirect_on_broken_pipe
+from sadgs_ns.worker import OnEvent, Worker, WorkerError
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""

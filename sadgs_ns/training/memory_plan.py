@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
+from sadgs_ns import host_memory
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
-from sadgs_ns.method import host_memory, memory
+from sadgs_ns.method import memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state

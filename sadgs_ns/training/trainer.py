@@ -18,16 +18,16 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sadgs_ns import events
+from sadgs_ns import events, interrupts
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training import checkpoints, compile_ahead, interrupts, processes
+from sadgs_ns.training import checkpoints, compile_ahead, processes
 from sadgs_ns.training.compilation import compile_kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.cuda_graphs import GraphedSteps
-from sadgs_ns.training.interrupts import SIGNALS, Interrupted, Interrupts
 from sadgs_ns.training.optimizers import SadgsOptimizers
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.planning import one_device_is_quicker, plan_length, plan_run

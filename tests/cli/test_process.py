@@ -48,11 +48,11 @@ from sadgs_ns.cli.cameras.photos import Photo, convert_photos, photos_by_camera,
 from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
-from sadgs_ns.cli.worker import Worker
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
+from sadgs_ns.worker import Worker
 
 
 @pytest.fixture(scope="module")

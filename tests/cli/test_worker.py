@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 from processes import HANGS
 
-from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import InputError
-from sadgs_ns.training.interrupts import Interrupted, Interrupts
+from sadgs_ns.interrupts import Interrupted, Interrupts
+from sadgs_ns.worker import Worker, WorkerError
 
 
 @pytest.fixture
@@ -163,7 +163,7 @@ def test_a_function_does_not_outlive_the_command_that_is_killed(program, tmp_pat
     log = program("import os, time\ndef function(): print(f'pid {os.getpid()}'); time.sleep(60)")
     parent = (
         f"import pathlib, sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        "from sadgs_ns.cli.worker import Worker\n"
+        "from sadgs_ns.worker import Worker\n"
         f"Worker('program:function', pathlib.Path({str(log)!r}), saves=True).run(on_event=print)"
     )
     command = subprocess.Popen([sys.executable, "-c", parent])

@@ -25,9 +25,10 @@ from kill_and_resume import configure, set_up
 from nerfstudio.cameras.cameras import Cameras
 
 from examples.drawn_scene.scene import write_scene
+from sadgs_ns import host_memory
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.method import host_memory, memory
+from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state

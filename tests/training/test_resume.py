@@ -44,11 +44,11 @@ from scenes import ITERATIONS
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.errors import InputError, WriteError
+from sadgs_ns.interrupts import SIGNALS
 from sadgs_ns.method.schedule import Schedule, schedule
 from sadgs_ns.training import planning
 from sadgs_ns.training.checkpoints import checkpoint_paths
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.interrupts import SIGNALS
 from sadgs_ns.training.resume import check_same_capture
 from sadgs_ns.training.trainer import SadgsTrainer
 

@@ -17,9 +17,9 @@ from runs import nerfstudio_data
 from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from sharded_runs import STRUCTURE_EVERY, few_steps, record, set_up_together
 
+from sadgs_ns import host_memory
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
-from sadgs_ns.method import host_memory
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.images import ImagePrefetcher, LazyImages, thread_count
 from sadgs_ns.training.memory_plan import choose_image_storage, image_bytes

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from sadgs_ns.cli.worker import Worker, WorkerError
 from sadgs_ns.errors import RunError, free_space
+from sadgs_ns.worker import Worker, WorkerError
 
 Report = Callable[[str, int, int], None]  # Called with a stage's name, the work that is done, and all its work
 _FULL_DISK = re.compile("no space left|disk is full|disk I/O error|file too large|failed to write", re.IGNORECASE)

@@ -44,7 +44,7 @@ from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
-from sadgs_ns.training.interrupts import Interrupts
+from sadgs_ns.interrupts import Interrupts
 
 MIN_SIZE = 64  # Least longest side of the result in px; no structure is left in smaller images
 _SECONDS_PER_LINE = 1.0  # Least time between two lines of a stage's progress in a file

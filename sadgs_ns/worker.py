@@ -25,7 +25,7 @@ from typing import Any
 
 from sadgs_ns import events
 from sadgs_ns.errors import InputError, RunError, sentence_of
-from sadgs_ns.training.interrupts import Interrupted
+from sadgs_ns.interrupts import Interrupted
 
 OnEvent = Callable[..., None]  # Called with an event's name and, by keyword, its fields
 _POLL_SECONDS = 0.1
