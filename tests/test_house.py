@@ -12,19 +12,20 @@ import sadgs_ns
 ROOT = Path(sadgs_ns.__file__).parent
 USES = {
     # folder: the other folders that its modules may import; all may import the modules that lie flat in the package
-    "cli": {"training", "viewer", "formats", "data", "method", "render", "kernels"},
+    "cli": {"training", "viewer", "formats", "data", "geometry", "method", "render", "kernels"},
     # The pipeline makes the panels that show its model; the test below keeps modules from importing in a circle.
-    "training": {"viewer", "data", "method", "distributed", "render", "kernels"},
-    "viewer": {"training", "method", "render"},
+    "training": {"viewer", "data", "geometry", "method", "distributed", "render", "kernels"},
+    "viewer": {"training", "geometry", "method", "render"},
     "formats": {"data"},
-    "data": set(),
+    "data": {"geometry"},  # which points count as outliers
+    "geometry": {"render"},
     "method": {"distributed", "render", "kernels"},
     "distributed": {"render", "kernels"},
     "render": {"kernels"},
     "kernels": set(),
     "": set(),
 }
-MAX_FLAT = 9
+MAX_FLAT = 8
 LINES = 18_261
 """Most lines of Python in the package. This number and those below may only fall: what is added takes the place of
 something, and who makes the package smaller lowers them."""

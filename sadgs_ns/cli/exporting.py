@@ -14,7 +14,7 @@ from sadgs_ns.training.deferred_imports import import_nerfstudio
 import_nerfstudio()  # It precedes what imports nerfstudio.
 
 from sadgs_ns.data import parsers, run_cameras  # noqa: E402, F401
-from sadgs_ns.method import cleaning  # noqa: E402, F401
+from sadgs_ns.geometry import cleaning  # noqa: E402, F401
 from sadgs_ns.training import checkpoints  # noqa: E402, F401
 
 

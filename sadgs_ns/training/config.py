@@ -24,8 +24,8 @@ from tyro.conf import Suppress
 
 from sadgs_ns.data.parsers import AnyParserConfig, AutomaticDataParserConfig
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.geometry.initialization import POINT_OPACITY
 from sadgs_ns.kernels import SWITCH, switched_off
-from sadgs_ns.method.initialization import POINT_OPACITY
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.method.strategy import StructureAwareStrategy

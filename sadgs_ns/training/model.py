@@ -17,13 +17,13 @@ from torch import Tensor
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
+from sadgs_ns.geometry.camera_paths import CameraPaths
+from sadgs_ns.geometry.initialization import camera_extent, neighbour_scales
+from sadgs_ns.geometry.near_plane import scene_near_plane
+from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.method.camera_paths import CameraPaths
-from sadgs_ns.method.initialization import camera_extent, neighbour_scales
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.near_plane import scene_near_plane
 from sadgs_ns.method.parameter_average import RunningMean
-from sadgs_ns.method.scale_limits import camera_distances, limit_scales
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world

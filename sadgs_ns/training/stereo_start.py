@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from sadgs_ns.method.dense_start import NUMBER, dense_points
+from sadgs_ns.geometry.dense_start import NUMBER, dense_points
+from sadgs_ns.geometry.initialization import plausible_points
+from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.method.eta import wavelength
-from sadgs_ns.method.initialization import plausible_points
 from sadgs_ns.method.quantization import dequantize
-from sadgs_ns.method.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.progress import note

@@ -11,7 +11,7 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, Vie
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
+from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
 from sadgs_ns.training.progress import warn
 from sadgs_ns.training.views import TrainingViews
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
+from sadgs_ns.geometry.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 
 NEAR = 2.0

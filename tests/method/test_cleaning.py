@@ -10,7 +10,7 @@ from scenes import camera, random_params
 from torch import Tensor
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
+from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.dense_start import SCALE, DensePoints, dense_points
-from sadgs_ns.method.stereo import DepthMap
+from sadgs_ns.geometry.dense_start import SCALE, DensePoints, dense_points
+from sadgs_ns.geometry.stereo import DepthMap
 
 HEIGHT, WIDTH = 240, 320
 SIZE = torch.tensor([WIDTH, HEIGHT])

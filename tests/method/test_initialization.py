@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.method.initialization import (
+from sadgs_ns.geometry.initialization import (
     bounding_box_points,
     camera_extent,
     neighbour_scales,

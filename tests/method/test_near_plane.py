@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.method import near_plane
-from sadgs_ns.method.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
+from sadgs_ns.geometry import near_plane
+from sadgs_ns.geometry.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from gsplat_like import splatted
 
-from sadgs_ns.method import scale_limits
-from sadgs_ns.method.scale_limits import camera_distances, limit_scales
+from sadgs_ns.geometry import scale_limits
+from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 
 
 def test_points_are_clear_of_cameras_from_their_radius_on():

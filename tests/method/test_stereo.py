@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sadgs_ns.method import stereo
-from sadgs_ns.method.stereo import DepthMap, choose_neighbours, depth_maps
+from sadgs_ns.geometry import stereo
+from sadgs_ns.geometry.stereo import DepthMap, choose_neighbours, depth_maps
 
 WIDTH, HEIGHT = 160, 120
 PLANES = {  # Normals n and offsets d of planes n · X = d. The nearest plane is seen.

@@ -36,7 +36,7 @@ from scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.near_plane import NEAR_SHARE
+from sadgs_ns.geometry.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes

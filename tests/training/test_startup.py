@@ -22,7 +22,7 @@ LATER = (
 
 def test_the_methods_import_nothing_that_training_does_not_need():
     start = f"import sys, torch, {', '.join(processes.IMPORTED)}"
-    start += "; from sadgs_ns.method.initialization import neighbour_scales; neighbour_scales(torch.rand(9, 3))"
+    start += "; from sadgs_ns.geometry.initialization import neighbour_scales; neighbour_scales(torch.rand(9, 3))"
     code = f"{start}; print([name for name in {LATER} if name in sys.modules])"
     run = processes.python(code)
     assert (run.returncode, run.stdout.strip()) == (0, "[]"), run.stderr

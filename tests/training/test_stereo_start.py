@@ -19,7 +19,7 @@ from scenes import HEIGHT, POINTS, WIDTH
 from examples.drawn_scene.scene import room_surfaces
 from sadgs_ns.data.parsers import points_in_the_run
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.stereo import depth_maps
+from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import datamanager, pipeline, presets, stereo_start
 from sadgs_ns.training.images import LazyImages

@@ -18,7 +18,7 @@ from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
 from sadgs_ns.data.checks.images import read_small
 from sadgs_ns.errors import InputError
-from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
+from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
 _FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, which then have 1,000 float32 steps
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01

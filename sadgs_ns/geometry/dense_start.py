@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.stereo import DepthMap
+from sadgs_ns.geometry.stereo import DepthMap
 
 NUMBER = 150_000  # Most points that are drawn
 MIN_CONFIDENCE = 0.5  # Confidence of a depth from which its pixel is drawn

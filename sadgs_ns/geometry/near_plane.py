@@ -11,7 +11,7 @@ import math
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.initialization import plausible_points
+from sadgs_ns.geometry.initialization import plausible_points
 
 NEAREST_POINTS = 5  # A view's fifth nearest SfM point is trusted; the four that are nearer may be errors
 NEAR_SHARE = 0.5

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns.outliers import CAMERA_SHARE, POINT_SHARE, far_outliers
+from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, far_outliers
 
 FACE_GRID = 16
 """Points along each side of a face (released code)."""
