@@ -12,10 +12,11 @@ import sadgs_ns
 ROOT = Path(sadgs_ns.__file__).parent
 USES = {
     # folder: the other folders that its modules may import; all may import the modules that lie flat in the package
-    "cli": {"training", "viewer", "formats", "data", "geometry", "method", "render", "kernels"},
+    "cli": {"placing", "training", "viewer", "formats", "data", "geometry", "method", "render", "kernels"},
     # The pipeline makes the panels that show its model; the test below keeps modules from importing in a circle.
     "training": {"viewer", "data", "geometry", "method", "distributed", "render", "kernels"},
     "viewer": {"training", "geometry", "method", "render"},
+    "placing": {"data", "cli"},
     "formats": {"data"},
     "data": {"geometry"},  # which points count as outliers
     "geometry": {"render"},

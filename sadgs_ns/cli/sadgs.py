@@ -23,12 +23,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from sadgs_ns.cli.cameras.command import Process, Scene, check_size
-from sadgs_ns.cli.cameras.folder import images_of
-from sadgs_ns.cli.cameras.photos import changes_of, photo_stamps
-from sadgs_ns.cli.cameras.plan import Summary
-from sadgs_ns.cli.cameras.video import count_frames
 from sadgs_ns.cli.export import Export
+from sadgs_ns.cli.process import Process, Scene, check_size
 from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
 from sadgs_ns.data.checks import check_data
@@ -40,6 +36,10 @@ from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 from sadgs_ns.method.schedule import MOST_EFFORT
+from sadgs_ns.placing.folder import images_of
+from sadgs_ns.placing.photos import changes_of, photo_stamps
+from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
@@ -255,7 +255,7 @@ class PhotosToSplat:
             elif event == "progress":
                 line.update(f"{added}{fields['stage']} {fields['done']} of {fields['total']}")
 
-        worker = self.worker("cameras", "sadgs_ns.cli.cameras.command:process")
+        worker = self.worker("cameras", "sadgs_ns.cli.process:process")
         source = os.path.abspath(self.source)
         command = ["sadgs-process", source, str(self._scene), "--max-size", str(self.options.max_size)]
         summary = Summary(**self.call(worker, line, on_event, command, self._process))

@@ -16,7 +16,7 @@ CENTER = (130.0, 90.0)
 @pytest.fixture(scope="module")
 def features():
     """The module is imported after Pillow, as in the command, where it has a process of its own."""
-    from sadgs_ns.cli.cameras import features
+    from sadgs_ns.placing import features
 
     return features
 

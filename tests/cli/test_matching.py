@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 @pytest.fixture(scope="module")
 def matching() -> ModuleType:
     """The module is imported after Pillow, as in the command, where it has a process of its own."""
-    from sadgs_ns.cli.cameras import matching
+    from sadgs_ns.placing import matching
 
     return matching
 
@@ -90,7 +90,7 @@ def parts_of_a_wall(folder: Path) -> list[str]:
 def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp_path: Path):
     import pycolmap
 
-    from sadgs_ns.cli.cameras import features
+    from sadgs_ns.placing import features
 
     names = parts_of_a_wall(tmp_path / "photos")
     inliers = []

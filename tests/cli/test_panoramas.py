@@ -15,10 +15,10 @@ import pytest
 from PIL import Image
 from room import draw_panorama, draw_photo, draw_photos, panorama_centres
 
-from sadgs_ns.cli.cameras.command import Process, process
-from sadgs_ns.cli.cameras.panoramas import VIEWS, cut, is_panorama, rotations
-from sadgs_ns.cli.cameras.photos import read_photos
-from sadgs_ns.cli.cameras.reconstruct import choose_pairs
+from sadgs_ns.cli.process import Process, process
+from sadgs_ns.placing.panoramas import VIEWS, cut, is_panorama, rotations
+from sadgs_ns.placing.photos import read_photos
+from sadgs_ns.placing.reconstruct import choose_pairs
 
 COUNT, HEIGHT, TURN = 12, 256, 0.2
 

@@ -39,18 +39,18 @@ from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
 from room import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
 
-from sadgs_ns.cli.cameras import command as program
-from sadgs_ns.cli.cameras import features, reconstruct
-from sadgs_ns.cli.cameras.colmap import make_model, start_colmap
-from sadgs_ns.cli.cameras.command import Process, Scene, main, process
-from sadgs_ns.cli.cameras.folder import find_source, look_into
-from sadgs_ns.cli.cameras.photos import Photo, convert_photos, photos_by_camera, read_photos, write_masks
-from sadgs_ns.cli.cameras.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
-from sadgs_ns.cli.cameras.reconstruct import check_written, match, sequential_pairs
-from sadgs_ns.cli.cameras.video import sharpest_frames, video_frames
+from sadgs_ns.cli import process as program
+from sadgs_ns.cli.process import Process, Scene, main, process
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.placing import features, reconstruct
+from sadgs_ns.placing.colmap import make_model, start_colmap
+from sadgs_ns.placing.folder import find_source, look_into
+from sadgs_ns.placing.photos import Photo, convert_photos, photos_by_camera, read_photos, write_masks
+from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
+from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
+from sadgs_ns.placing.video import sharpest_frames, video_frames
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.worker import Worker
 
@@ -591,7 +591,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
         masks.update((path.name, Image.open(path).getextrema()) for path in (out / "work").glob("masks/*"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", look)
+    monkeypatch.setattr("sadgs_ns.cli.process.make_model", look)
     assert main([str(source), str(out)]) == 130
     assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
@@ -889,7 +889,7 @@ def test_heic_is_read_as_a_phone_means_it(tmp_path: Path):
 @pytest.mark.hard_case("HEIC, without the library that reads it, as in an older environment", "a line counts the files")
 def test_heic_is_left_out_without_its_library(tmp_path: Path):
     (tmp_path / "IMG_1.HEIC").write_bytes(HEIC)
-    code = "import sys; sys.modules['pi_heif'] = None; from sadgs_ns.cli.cameras.folder import look_into as look; "
+    code = "import sys; sys.modules['pi_heif'] = None; from sadgs_ns.placing.folder import look_into as look; "
     code += "from pathlib import Path; print(look(Path(sys.argv[1]), Path('out')))"
     told = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True).stdout
     assert told.startswith("([], {}, ['Left out as images that are not read ") and "1, such as IMG_1.HEIC" in told
@@ -933,7 +933,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
             (folder / "database.db").write_bytes(b"features")
             return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
 
-        monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", stand_in)
+        monkeypatch.setattr("sadgs_ns.cli.process.make_model", stand_in)
         monkeypatch.setattr(program, "_publish", lambda *others: None)
 
     return register
@@ -980,7 +980,7 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
         assert main(command) == 2 and (folder / "models").is_dir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", run_another)
+    monkeypatch.setattr("sadgs_ns.cli.process.make_model", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
@@ -1040,7 +1040,7 @@ def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatc
     """The device is the CPU here, which goes the GPU's way."""
     calls: list[tuple] = []
     monkeypatch.setattr(
-        "sadgs_ns.cli.cameras.matching.write_matches",
+        "sadgs_ns.placing.matching.write_matches",
         lambda database, pairs, device, stage: calls.append((*pairs, device)),
     )
     monkeypatch.setattr(pycolmap, "geometric_verification", lambda database, **options: calls.append(("verified",)))
@@ -1257,7 +1257,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.cameras.command.make_model", stop)
+    monkeypatch.setattr("sadgs_ns.cli.process.make_model", stop)
     return runs
 
 
@@ -1269,7 +1269,7 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("sadgs_ns.cli.cameras.video.sharpest_frames", interrupted)
+        patched.setattr("sadgs_ns.placing.video.sharpest_frames", interrupted)
         assert main(command) == 130 and not list((tmp_path / "out").rglob("*.jpg"))
     assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
     monkeypatch.setattr(program, "video_frames", None)  # a third run reads none again

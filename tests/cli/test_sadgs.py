@@ -24,11 +24,11 @@ from runs import nerfstudio_data
 from scenes import HEIGHT, WIDTH
 
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.cameras.plan import Summary
 from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
+from sadgs_ns.placing.plan import Summary
 
 TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
 """More Gaussians take a second a step."""

@@ -16,8 +16,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from sadgs_ns.cli.cameras.plan import NEIGHBORS
 from sadgs_ns.events import progress
+from sadgs_ns.placing.plan import NEIGHBORS
 
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
 """Largest angle between matching descriptors in radians, and its largest ratio to the next best's; COLMAP's."""

@@ -14,11 +14,11 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from sadgs_ns.cli.cameras.panoramas import VIEWS, rotations
-from sadgs_ns.cli.cameras.photos import threads
 from sadgs_ns.data.checks.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.host_memory import available_host_bytes
+from sadgs_ns.placing.panoramas import VIEWS, rotations
+from sadgs_ns.placing.photos import threads
 
 MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
 MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does

@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pycolmap
 
-from sadgs_ns.cli.cameras.features import LISTED, UNLISTED, extract, rename_images
-from sadgs_ns.cli.cameras.panoramas import rotations
-from sadgs_ns.cli.cameras.photos import empty_folder, in_order
-from sadgs_ns.cli.cameras.plan import Matching, Summary
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
+from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
+from sadgs_ns.placing.panoramas import rotations
+from sadgs_ns.placing.photos import empty_folder, in_order
+from sadgs_ns.placing.plan import Matching, Summary
 
 if TYPE_CHECKING:
     import torch
@@ -99,7 +99,7 @@ def wake_gpu() -> torch.device | None:
     """Import torch, and return the CUDA device if there is one, ready to compute."""
     import torch
 
-    import_module("sadgs_ns.cli.cameras.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
+    import_module("sadgs_ns.placing.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
     if not torch.cuda.is_available():
         return None
     device = torch.device("cuda")
@@ -150,7 +150,7 @@ def match(
 
     A GPU compares the features and COLMAP verifies the matches; without one COLMAP does both, by lists in `pairs.txt`.
     """
-    from sadgs_ns.cli.cameras.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
+    from sadgs_ns.placing.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
 
     stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()

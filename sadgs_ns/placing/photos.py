@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps, UnidentifiedImageError
 
-from sadgs_ns.cli.cameras.folder import COLMAP_FORMATS
-from sadgs_ns.cli.cameras.panoramas import VIEWS, cut, is_panorama
 from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS, color_profile
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.placing.folder import COLMAP_FORMATS
+from sadgs_ns.placing.panoramas import VIEWS, cut, is_panorama
 
 _KEPT_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}  # COLMAP writes by these, and reads by content.
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)

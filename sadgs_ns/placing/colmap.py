@@ -30,7 +30,7 @@ def start_colmap() -> Iterator[Worker]:
     """Start the process of COLMAP, which imports what it needs, and kill it when the context is left."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Worker("sadgs_ns.cli.cameras.colmap_process:make_model", Path(folder) / "colmap.txt") as worker,
+        Worker("sadgs_ns.placing.colmap_process:make_model", Path(folder) / "colmap.txt") as worker,
     ):
         yield worker
 

@@ -23,10 +23,15 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns import events
-from sadgs_ns.cli.cameras.colmap import Report, make_model, start_colmap
-from sadgs_ns.cli.cameras.folder import find_source, find_videos
-from sadgs_ns.cli.cameras.panoramas import VIEWS
-from sadgs_ns.cli.cameras.photos import (
+from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
+from sadgs_ns.data.checks.layouts import poses_elsewhere
+from sadgs_ns.data.coordinates import FRAME_KEYS
+from sadgs_ns.errors import InputError, WriteError
+from sadgs_ns.interrupts import Interrupts
+from sadgs_ns.placing.colmap import Report, make_model, start_colmap
+from sadgs_ns.placing.folder import find_source, find_videos
+from sadgs_ns.placing.panoramas import VIEWS
+from sadgs_ns.placing.photos import (
     Photo,
     changes_of,
     convert_photos,
@@ -38,13 +43,8 @@ from sadgs_ns.cli.cameras.photos import (
     write_alpha,
     write_masks,
 )
-from sadgs_ns.cli.cameras.plan import Matching, Summary, choose_matching
-from sadgs_ns.cli.cameras.video import video_frames, write_frames
-from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
-from sadgs_ns.data.checks.layouts import poses_elsewhere
-from sadgs_ns.data.coordinates import FRAME_KEYS
-from sadgs_ns.errors import InputError, WriteError
-from sadgs_ns.interrupts import Interrupts
+from sadgs_ns.placing.plan import Matching, Summary, choose_matching
+from sadgs_ns.placing.video import video_frames, write_frames
 
 MIN_SIZE = 64  # Least longest side of the result in px; no structure is left in smaller images
 _SECONDS_PER_LINE = 1.0  # Least time between two lines of a stage's progress in a file
