@@ -117,7 +117,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
 
     from benchmarks import evaluate
     from benchmarks.curve import Curve, LoopTimer, point
-    from sadgs_ns.training import processes
+    from sadgs_ns.training.run import processes
 
     devices = processes.number_of_processes()
     seconds["import_seconds"] = time.perf_counter() - start

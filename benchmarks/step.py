@@ -24,7 +24,7 @@ from sadgs_ns.method.statistics import observe
 from sadgs_ns.method.strategy import empty_state
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
 
 REPEATS = 20
 """Calls in a row that are timed together."""

@@ -38,9 +38,9 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from examples.drawn_scene.demonstration import fit_densification
 from examples.drawn_scene.scene import EVAL_INTERVAL, SPARSE_FOLDER, write_scene
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.optimizers import AdamUpdate
 from sadgs_ns.training.presets import sadgs
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.optimizers import AdamUpdate
 
 PLACES = ("within a step", "after a split", "saving", "after renaming", "after a step", "from outside")
 

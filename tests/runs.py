@@ -26,7 +26,7 @@ from examples.drawn_scene.scene import arc_views, room_surfaces
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.presets import sadgs
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 TRAIN_VIEWS = 8
 """Of 10, the parser holds out the first and the ninth."""

@@ -12,7 +12,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 STRUCTURE_EVERY = 6
 

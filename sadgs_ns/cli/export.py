@@ -191,7 +191,7 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     from torch import Tensor
 
     from sadgs_ns.render.types import RenderOptions
-    from sadgs_ns.training import checkpoints
+    from sadgs_ns.training.run import checkpoints
 
     checkpoint = _checkpoint_of(run)
     folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)

@@ -44,7 +44,7 @@ from sadgs_ns.worker import OnEvent, Worker, WorkerError
 
 _OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
 """Options of ns-train that this command sets."""
-_TRAINING, _EXPORT = "sadgs_ns.training.start:train", "sadgs_ns.cli.exporting:export_all"
+_TRAINING, _EXPORT = "sadgs_ns.training.run.start:train", "sadgs_ns.cli.exporting:export_all"
 _LOCK_SECONDS = 10.0  # Time in which the last stage of a killed run may save
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
 """Stage and part of the time that begin with a stage, if others than itself."""
@@ -409,7 +409,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     end = words.index("--") if "--" in words else len(words)
     train_options = words[end + 1 :]
     if not {"-h", "--help"}.isdisjoint(train_options):
-        from sadgs_ns.training.start import read_options  # It imports torch.
+        from sadgs_ns.training.run.start import read_options  # It imports torch.
 
         read_options(train_options)  # It prints the help and exits.
     options = parse(Sadgs, "sadgs", words[:end])

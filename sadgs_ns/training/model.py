@@ -23,7 +23,6 @@ from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.parameter_average import RunningMean
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
@@ -32,8 +31,9 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.run_plan import RunPlan
+from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.step.parameter_average import RunningMean
 from sadgs_ns.viewer import maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 

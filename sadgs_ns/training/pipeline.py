@@ -19,18 +19,18 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
-from sadgs_ns.training import nonfinite
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
-from sadgs_ns.training.images import stack
-from sadgs_ns.training.memory_plan import choose_image_storage
 from sadgs_ns.training.model import NORMALS, SadgsModel
-from sadgs_ns.training.nonfinite import NonFiniteLog
-from sadgs_ns.training.progress import note, warn
-from sadgs_ns.training.run_plan import RunPlan
-from sadgs_ns.training.structure_cache import StructureCache
-from sadgs_ns.training.train_step import StepResult, ViewGroup
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.run.memory_plan import choose_image_storage
+from sadgs_ns.training.run.progress import note, warn
+from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.step import nonfinite
+from sadgs_ns.training.step.images import stack
+from sadgs_ns.training.step.nonfinite import NonFiniteLog
+from sadgs_ns.training.step.structure_cache import StructureCache
+from sadgs_ns.training.step.train_step import StepResult, ViewGroup
+from sadgs_ns.training.step.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import shows_output
 from sadgs_ns.viewer.structure_panel import StructurePanel

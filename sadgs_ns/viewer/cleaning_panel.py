@@ -12,8 +12,8 @@ from torch import Tensor
 
 from sadgs_ns.errors import reason
 from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.step.views import TrainingViews
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 
 OUTPUT = "cleaned"  # Name of the panel's picture among the viewer's output types

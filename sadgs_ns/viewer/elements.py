@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
 from torch import Tensor
 
-from sadgs_ns.training.progress import warn
+from sadgs_ns.training.run.progress import warn
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -22,9 +22,9 @@ from sadgs_ns.errors import reason
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.run_plan import RunPlan
-from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
+from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.step.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output

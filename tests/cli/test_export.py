@@ -32,8 +32,8 @@ from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, html
-from sadgs_ns.training.run_folder import write_config
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 PARAMS = {

@@ -34,7 +34,7 @@ from sadgs_ns.render import rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.structure_cache import observe_training_views
+from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view

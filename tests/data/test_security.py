@@ -38,7 +38,7 @@ from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from sadgs_ns.training import presets
 from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 
 class Payload:

@@ -30,7 +30,7 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
 
 triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.method import color_matrices
-from sadgs_ns.method.color_matrices import anchored, correct_colors
+from sadgs_ns.training.step import color_matrices
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 
 fused = pytest.importorskip("sadgs_ns.kernels.color_matrices", reason="Triton is not installed")
 

@@ -38,7 +38,7 @@ from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.step.views import TrainingViews
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")

@@ -41,11 +41,11 @@ from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.types import Cameras
-from sadgs_ns.training import nonfinite, train_step
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
-from sadgs_ns.training.train_step import ViewGroup
+from sadgs_ns.training.step import nonfinite, train_step
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.train_step import ViewGroup
 
 CPU = torch.device("cpu")
 WIDTH, HEIGHT = 32, 24

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from sadgs_ns.method.parameter_average import RunningMean
+from sadgs_ns.training.step.parameter_average import RunningMean
 
 
 def test_the_mean_is_that_of_all_that_was_added_in_float64():

@@ -15,9 +15,9 @@ from torch import Tensor
 from benchmarks import exposures
 from benchmarks.evaluate import quality
 from examples.drawn_scene.scene import write_scene
-from sadgs_ns.method.color_matrices import anchored
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.color_matrices import anchored
 
 WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 14, 1500
 """Of the room; fewer points, or smaller photos, tell too little of their exposure."""

@@ -10,9 +10,10 @@ import torch
 from triton_compiler import run_with_the_compiler
 
 from sadgs_ns import kernels
-from sadgs_ns.training import compilation, stages
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.kernels_ahead import compilation
+from sadgs_ns.training.kernels_ahead import probes as stages
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 FIRST_RUN = """
 import sys
@@ -20,7 +21,7 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 from kill_and_resume import configure
 from compile_timer import CompileTimer
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 config = configure(Path(sys.argv[2]), Path(sys.argv[3]), 100, save_every=0)
 config.machine.device_type = "cuda"

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from triton_compiler import run_with_the_compiler
 
-from sadgs_ns.training import compile_ahead
+from sadgs_ns.training.kernels_ahead import compile_ahead
 
 IDLE_DRIVER = """
 import os, sys
@@ -43,7 +43,7 @@ compile_ahead.find_kernels()  # with stand-ins for what would be computed
 from dataclasses import replace
 from triton import knobs
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.training.stages import KernelChoice, Stages
+from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 
 found, missing = [], []
 def listen(*, src, cache_hit, **_):

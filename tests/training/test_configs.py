@@ -25,7 +25,7 @@ from processes import HANGS
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.training import initial_gaussians, presets, stereo_start
+from sadgs_ns.training import initial_gaussians, presets
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import (
     PoseOptimizerConfig,
@@ -37,7 +37,8 @@ from sadgs_ns.training.config import (
     SadgsViewerConfig,
 )
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.training.run import stereo_start
+from sadgs_ns.training.step.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -18,10 +18,10 @@ from runs import configure
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.training import cuda_graphs, optimizers
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.cuda_graphs import Results
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step import cuda_graphs, optimizers
+from sadgs_ns.training.step.cuda_graphs import Results
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
 

@@ -31,11 +31,12 @@ from scenes import HEIGHT, WIDTH
 
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.training import checkpoints, nonfinite
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.presets import sadgs
-from sadgs_ns.training.run_folder import write_config
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run import checkpoints
+from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step import nonfinite
 
 ITERATIONS = 6
 

@@ -24,13 +24,13 @@ from scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.cli.inspection import get_view
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
-from sadgs_ns.training import structure_cache
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
-from sadgs_ns.training.images import ImagePrefetcher
-from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
-from sadgs_ns.training.trainer import SadgsTrainer
-from sadgs_ns.training.views import ViewSampler
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step import structure_cache
+from sadgs_ns.training.step.images import ImagePrefetcher
+from sadgs_ns.training.step.structure_cache import StructureCache, observe_training_views
+from sadgs_ns.training.step.views import ViewSampler
 
 COMPRESSED: Any = "compressed"
 TIERS = ("gpu", "cpu", COMPRESSED)

@@ -32,7 +32,7 @@ from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
-from sadgs_ns.training.memory_plan import (
+from sadgs_ns.training.run.memory_plan import (
     TrainingSize,
     choose_image_storage,
     fit_to_memory,

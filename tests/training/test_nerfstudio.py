@@ -43,11 +43,11 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel, load_lpips
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.presets import RATES
-from sadgs_ns.training.train_step import training_step
-from sadgs_ns.training.trainer import SadgsTrainer
-from sadgs_ns.training.views import ViewSampler
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.train_step import training_step
+from sadgs_ns.training.step.views import ViewSampler
 
 
 @pytest.fixture(scope="module")
@@ -370,7 +370,7 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(
         assert 0 < photometric < 2 and opacity_reg in (0, 100)
         return result
 
-    monkeypatch.setattr("sadgs_ns.training.trainer.training_step", look)
+    monkeypatch.setattr("sadgs_ns.training.run.trainer.training_step", look)
     set_up(config).train()
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
@@ -439,7 +439,7 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
     monkeypatch.setattr(adam, "adam_step", counted)
     before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
     monkeypatch.setattr(
-        "sadgs_ns.training.optimizers.use_triton", lambda place: True
+        "sadgs_ns.training.step.optimizers.use_triton", lambda place: True
     )  # in its interpreter, without CUDA
     trainer.train()
     assert launched == [6] * 3

@@ -15,8 +15,8 @@ from gsplat.strategy.ops import remove
 from torch import Tensor
 
 from sadgs_ns import kernels
-from sadgs_ns.training.nonfinite import NonFiniteLog
-from sadgs_ns.training.optimizers import (
+from sadgs_ns.training.step.nonfinite import NonFiniteLog
+from sadgs_ns.training.step.optimizers import (
     AdamUpdate,
     FusedAdamOptimizerConfig,
     RunLengthDecaySchedulerConfig,

@@ -26,7 +26,7 @@ from runs import train
 from sadgs_ns import errors
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.run_folder import write_config
+from sadgs_ns.training.run.run_folder import write_config
 
 HELD_OUT = {0: 1.0, 1: 0.9}
 """Number of held-out views, and the share of the drawn scene's 10 views that is then trained on."""

@@ -105,7 +105,7 @@ def test_steps_whose_lists_are_too_short_change_and_count_nothing_and_their_view
     monkeypatch: pytest.MonkeyPatch,
 ):
     """Parameters, moments and statistics stay as they are. Densification follows the steps 4 and 7."""
-    monkeypatch.setattr("sadgs_ns.training.optimizers.use_triton", lambda place: True)
+    monkeypatch.setattr("sadgs_ns.training.step.optimizers.use_triton", lambda place: True)
     too_short = (2, 6, 9)
     forecast, states = Observed(too_short), []
 

@@ -24,9 +24,9 @@ from rich.console import Console
 from scenes import ITERATIONS
 
 from sadgs_ns.cli import export
-from sadgs_ns.training import progress
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.progress import ProgressTable, cpu_notice, duration, remove_tables, time_left
+from sadgs_ns.training.run import progress
+from sadgs_ns.training.run.progress import ProgressTable, cpu_notice, duration, remove_tables, time_left
 
 
 @pytest.fixture

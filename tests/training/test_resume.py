@@ -46,11 +46,11 @@ from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.interrupts import SIGNALS
 from sadgs_ns.method.schedule import Schedule, schedule
-from sadgs_ns.training import planning
-from sadgs_ns.training.checkpoints import checkpoint_paths
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.resume import check_same_capture
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run import planning
+from sadgs_ns.training.run.checkpoints import checkpoint_paths
+from sadgs_ns.training.run.resume import check_same_capture
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 
 def after(trainer: SadgsTrainer, at: int, act: Callable[[], None]) -> None:
@@ -136,7 +136,7 @@ class Clock:
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], tick))
         monkeypatch.setattr(torch, "save", slow_save)
-        monkeypatch.setattr("sadgs_ns.training.trainer.time", SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr("sadgs_ns.training.run.trainer.time", SimpleNamespace(monotonic=lambda: self.now))
 
 
 @pytest.mark.hard_case(

@@ -20,8 +20,8 @@ from sadgs_ns.cli import export
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.types import RenderOptions
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.run_plan import Rate, RunPlan
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.run_plan import Rate, RunPlan
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 OPTIONS, RATES = ({field.name for field in dataclasses.fields(cls)} for cls in (StructureAwareStrategy, Rate))
 

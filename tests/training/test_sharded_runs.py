@@ -28,10 +28,10 @@ from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedExc
 
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
-from sadgs_ns.training import trainer as trainer_module
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.presets import sadgs
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run import trainer as trainer_module
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 
 @pytest.mark.parametrize(("ranks", "views"), [(2, 2), (3, 2)])

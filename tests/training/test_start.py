@@ -16,7 +16,7 @@ import torch
 from kill_and_resume import differences
 from scenes import VIEWS
 
-from sadgs_ns.training.deferred_imports import DEFERRED
+from sadgs_ns.training.run.deferred_imports import DEFERRED
 
 UNUSED = (
     "nerfstudio.configs.method_configs", "nerfstudio.viewer.viewer", "nerfstudio.scripts.train", "torch._dynamo",
@@ -24,8 +24,8 @@ UNUSED = (
 )  # fmt: skip
 TRAINING = f"""
 import json, sys
-from sadgs_ns.training.deferred_imports import StandIn
-from sadgs_ns.training.start import train
+from sadgs_ns.training.run.deferred_imports import StandIn
+from sadgs_ns.training.run.start import train
 del sys.argv[0]
 train()
 held = [

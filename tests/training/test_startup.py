@@ -12,7 +12,7 @@ from kill_and_resume import set_up
 from scenes import HEIGHT, ITERATIONS, WIDTH
 
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 LATER = (
     "sadgs_ns.cli", "benchmarks", "examples.drawn_scene", "pycolmap", "torchmetrics", "matplotlib.figure", "open3d",

@@ -21,8 +21,9 @@ from sadgs_ns.data.parsers import points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training import datamanager, pipeline, presets, stereo_start
-from sadgs_ns.training.images import LazyImages
+from sadgs_ns.training import datamanager, pipeline, presets
+from sadgs_ns.training.run import stereo_start
+from sadgs_ns.training.step.images import LazyImages
 
 
 @pytest.fixture

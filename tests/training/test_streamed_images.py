@@ -21,10 +21,10 @@ from sadgs_ns import host_memory
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.images import ImagePrefetcher, LazyImages, thread_count
-from sadgs_ns.training.memory_plan import choose_image_storage, image_bytes
-from sadgs_ns.training.structure_cache import StructureCache
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.run.memory_plan import choose_image_storage, image_bytes
+from sadgs_ns.training.step.images import ImagePrefetcher, LazyImages, thread_count
+from sadgs_ns.training.step.structure_cache import StructureCache
+from sadgs_ns.training.step.views import TrainingViews
 
 TRAINING = VIEWS - 1
 """Number of views that the parser does not hold out."""

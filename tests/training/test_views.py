@@ -11,8 +11,8 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
 from sadgs_ns.distributed.world import World
-from sadgs_ns.training.images import ImagePrefetcher
-from sadgs_ns.training.views import TrainingViews, ViewSampler
+from sadgs_ns.training.step.images import ImagePrefetcher
+from sadgs_ns.training.step.views import TrainingViews, ViewSampler
 
 STEPS = 1000
 

@@ -22,8 +22,8 @@ from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.run_folder import write_config
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.trainer import SadgsTrainer
 from sadgs_ns.viewer.elements import LazyOutputs, shows_output
 from sadgs_ns.viewer.maps import normals_map
 

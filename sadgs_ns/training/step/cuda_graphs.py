@@ -19,9 +19,9 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.optimizers import AdamUpdate
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.train_step import StepResult, ViewGroup, training_step
+from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.step.optimizers import AdamUpdate
+from sadgs_ns.training.step.train_step import StepResult, ViewGroup, training_step
 
 MOST_GAUSSIANS = 2**20  # Steps of more Gaussians × views keep a GPU busy without a graph, which would only take memory
 MOST_GRAPHS = 16

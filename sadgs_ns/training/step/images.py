@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.training.processes import processes_on_this_machine
+from sadgs_ns.training.run.processes import processes_on_this_machine
 
 _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
 """Takes data and image [H, W(, C)]; returns intrinsics in px [3, 3], image, and perhaps mask [H, W, 1] undistorted."""

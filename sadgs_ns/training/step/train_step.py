@@ -16,12 +16,12 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.rasterization import rasterize
-from sadgs_ns.method.color_matrices import anchored, correct_colors
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, RenderOptions
-from sadgs_ns.training.images import stack, stack_masks
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.optimizers import AdamUpdate
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
+from sadgs_ns.training.step.images import stack, stack_masks
+from sadgs_ns.training.step.optimizers import AdamUpdate
 
 
 @dataclass(frozen=True)

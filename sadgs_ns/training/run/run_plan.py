@@ -12,7 +12,7 @@ import yaml
 from sadgs_ns.files import atomic_path
 from sadgs_ns.method.schedule import Schedule, between_one_and_four
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.training.optimizers import RunLengthDecaySchedulerConfig
+from sadgs_ns.training.step.optimizers import RunLengthDecaySchedulerConfig
 
 RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
 """Factors on learning rates at the first and at the last iteration in steps of four views. Rates that fall after

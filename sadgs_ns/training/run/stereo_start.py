@@ -11,7 +11,7 @@ from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import note
+from sadgs_ns.training.run.progress import note
 
 FEWEST_VIEWS, MOST_VIEWS = 3, 60
 """Numbers of training views with which a run starts from stereo depth by default. With more views it brought no PSNR

@@ -8,7 +8,7 @@ import random
 import sys
 from collections.abc import Sequence
 
-from sadgs_ns.training import compile_ahead
+from sadgs_ns.training.kernels_ahead import compile_ahead
 
 if {"-h", "--help"}.isdisjoint(sys.argv):
     compile_ahead.begin()  # It goes on while the rest is imported.
@@ -19,15 +19,15 @@ import tyro
 from tyro.conf import FlagConversionOff, SuppressFixed
 
 from sadgs_ns.events import report
-from sadgs_ns.training.deferred_imports import import_nerfstudio
+from sadgs_ns.training.run.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # This comes before any import of nerfstudio.
 
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sadgs_ns.training import trainer  # noqa: F401 - a run's config imports it when it begins
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.presets import sadgs
+from sadgs_ns.training.run import trainer  # noqa: F401 - a run's config imports it when it begins
 
 
 def read_options(words: Sequence[str]) -> TrainerConfig:

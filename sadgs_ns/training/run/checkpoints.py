@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
-from sadgs_ns.training.progress import warn
+from sadgs_ns.training.run.progress import warn
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
 _FOLDER = "nerfstudio_models"  # Name of the folder of checkpoints in a run's folder

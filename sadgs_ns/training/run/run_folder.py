@@ -15,7 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sadgs_ns.data.parsers import check_capture, keep_findings
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
-from sadgs_ns.training import checkpoints, processes
+from sadgs_ns.training.run import checkpoints, processes
 
 
 def begin(config: TrainerConfig) -> None:

@@ -10,10 +10,10 @@ from nerfstudio.cameras.cameras import Cameras
 
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
-from sadgs_ns.training.memory_plan import fit_to_memory, training_size
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import cpu_notice, note, warn
-from sadgs_ns.training.run_plan import RunPlan, plan_rates
+from sadgs_ns.training.run.memory_plan import fit_to_memory, training_size
+from sadgs_ns.training.run.progress import cpu_notice, note, warn
+from sadgs_ns.training.run.run_plan import RunPlan, plan_rates
 
 DENSE_THRESHOLDS = 1.25
 """Factor on AbsGS's thresholds if a run starts from stereo depth, which adds Gaussians. The factor removes as many, and

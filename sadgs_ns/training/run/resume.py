@@ -17,10 +17,10 @@ from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.geometry.initialization import camera_extent
-from sadgs_ns.training import checkpoints
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import note, warn
-from sadgs_ns.training.run_plan import RunPlan
+from sadgs_ns.training.run import checkpoints
+from sadgs_ns.training.run.progress import note, warn
+from sadgs_ns.training.run.run_plan import RunPlan
 
 _SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' extent count as one
 

@@ -16,8 +16,8 @@ from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.types import Cameras
-from sadgs_ns.training.images import stack_masks
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.step.images import stack_masks
+from sadgs_ns.training.step.views import TrainingViews
 
 PIXELS_PER_BATCH = 4_000_000  # Pixels of the images whose structure tensors are computed at once; each takes 300 bytes
 

@@ -12,10 +12,10 @@ import torch
 from sadgs_ns.errors import reason
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.training import compile_ahead
+from sadgs_ns.training.kernels_ahead import compile_ahead
+from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.progress import note, warn
-from sadgs_ns.training.stages import KernelChoice, Stages
+from sadgs_ns.training.run.progress import note, warn
 
 _PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting for
 

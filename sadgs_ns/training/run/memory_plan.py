@@ -15,8 +15,8 @@ from sadgs_ns.method import memory
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
-from sadgs_ns.training.processes import least, number_of_processes, processes_on_this_machine
-from sadgs_ns.training.structure_cache import PIXELS_PER_BATCH
+from sadgs_ns.training.run.processes import least, number_of_processes, processes_on_this_machine
+from sadgs_ns.training.step.structure_cache import PIXELS_PER_BATCH
 
 PLANNED_SHARE = 0.8  # Share of the available memory to plan with; the rest is for fragments and other programs
 QUANTIZED_BYTES = 3  # Bytes that S̄ takes for each pixel of the training images (`method.quantization`)

@@ -68,7 +68,7 @@ def _marker() -> Path | None:
         key = f"{cards} {os.environ.get('CUDA_VISIBLE_DEVICES')} {version('torch')} {version('triton')} {sys.version}"
     except PackageNotFoundError:
         return None
-    sources = [*sorted((_HERE.parent / "kernels").glob("*.py")), _HERE / "stages.py", _HERE / "compile_ahead.py"]
+    sources = [*sorted((_HERE.parents[1] / "kernels").glob("*.py")), _HERE / "probes.py", _HERE / "compile_ahead.py"]
     digest = hashlib.sha256(b"".join([key.encode(), *(path.read_bytes() for path in sources)])).hexdigest()
     home = Path(os.environ.get("TRITON_HOME") or Path.home())
     return Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache") / f"sadgs-{digest[:16]}"
@@ -83,7 +83,7 @@ def find_kernels() -> None:
 
     from sadgs_ns import gsplat_compat
     from sadgs_ns.kernels import tiles, trial, triton_switched
-    from sadgs_ns.training.stages import KernelChoice, Stages
+    from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 
     known = set()
 

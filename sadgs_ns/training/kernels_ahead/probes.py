@@ -10,7 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns.method.color_matrices import correct_colors
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
@@ -19,7 +18,8 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
-from sadgs_ns.training.nonfinite import MAX_GRADIENT
+from sadgs_ns.training.step.color_matrices import correct_colors
+from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
 
 _GAUSSIANS, _SIZE = 64, 64  # Number of Gaussians, and width and height in px, with which the kernels are tried
 _DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")

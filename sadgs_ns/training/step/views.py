@@ -16,8 +16,8 @@ from torch import Tensor
 from sadgs_ns.data.cameras import check_undistortion
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training.images import ImagePrefetcher, thread_count
 from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.step.images import ImagePrefetcher, thread_count
 
 
 class ViewSampler:
