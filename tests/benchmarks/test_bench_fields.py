@@ -17,9 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gsplat_like import splatted
 from PIL import Image
-from processes import HANGS
 from torch import Tensor
 
 from benchmarks import __main__ as bench
@@ -27,6 +25,8 @@ from benchmarks import curve, evaluate, protocol, run
 from benchmarks.curve import undisturbed
 from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.forked_python import HANGS
+from helpers.gsplat_like import splatted
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10

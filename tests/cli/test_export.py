@@ -16,16 +16,16 @@ import torch
 import trimesh
 import yaml
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
-from gsplat_like import splatted
 from hypothesis import given
 from hypothesis import strategies as st
-from kill_and_resume import configure, parser_of, set_up
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from plyfile import PlyData
-from runs import nerfstudio_data
 from scipy.spatial.transform import Rotation
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.gsplat_like import splatted
+from helpers.kill_and_resume import configure, parser_of, set_up
+from helpers.short_runs import nerfstudio_data
 from sadgs_ns.cli import export
 from sadgs_ns.cli.export import Export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics

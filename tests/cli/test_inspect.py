@@ -15,16 +15,16 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from kill_and_resume import configure, set_up
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.configs.method_configs import method_configs
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
-from runs import in_the_viewer
 
 from examples.drawn_scene.scene import write_scene
+from helpers.kill_and_resume import configure, set_up
+from helpers.short_runs import in_the_viewer
 from sadgs_ns.cli import inspect, inspection
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.growth import structure_aware

@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from PIL import Image
-from processes import HANGS
 from rich.console import Console
-from room import draw_photos
-from runs import nerfstudio_data
-from scenes import HEIGHT, WIDTH
 
+from helpers.drawn_photos import draw_photos
+from helpers.forked_python import HANGS
+from helpers.short_runs import nerfstudio_data
+from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main

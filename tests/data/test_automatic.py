@@ -23,10 +23,10 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
-from runs import blender_data, configure, nerfstudio_data, train
-from scenes import HEIGHT, VIEWS, WIDTH
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.short_runs import blender_data, configure, nerfstudio_data, train
+from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.parsers import AutomaticDataParserConfig, ColmapParser, check_capture, choose_parser

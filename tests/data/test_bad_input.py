@@ -28,9 +28,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.scripts.train import entrypoint
 from PIL import Image, ImageFile
-from processes import HANGS
-from room import color_profile
-from runs import (
+from torch import Tensor
+
+from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.drawn_photos import color_profile
+from helpers.forked_python import HANGS
+from helpers.short_runs import (
     blender_data,
     configure,
     is_finite,
@@ -38,10 +41,7 @@ from runs import (
     set_up,
     train,
 )
-from scenes import HEIGHT, WIDTH
-from torch import Tensor
-
-from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, parsers
 from sadgs_ns.data.checks import check_data

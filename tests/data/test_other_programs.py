@@ -17,9 +17,9 @@ import tyro
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from runs import blender_data, nerfstudio_data
-from scenes import HEIGHT, WIDTH
 
+from helpers.short_runs import blender_data, nerfstudio_data
+from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.parsers import TransformsParser

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from triton_compiler import run_with_the_compiler
+
+from helpers.triton_compiler import run_with_the_compiler
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
@@ -130,7 +131,7 @@ sys.path.insert(0, sys.argv[1])
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from compile_timer import CompileTimer
+from helpers.compile_timer import CompileTimer
 from sadgs_ns.kernels.trial import _write_one
 
 def compile():

@@ -21,11 +21,11 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
-from runs import configure, is_finite, set_up
-from scenes import adam, camera, random_params, training_step
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.short_runs import configure, is_finite, set_up
+from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns import kernels
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World

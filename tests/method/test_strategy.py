@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
-from scenes import adam, camera, random_params, training_step
 
+from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows

@@ -8,11 +8,11 @@ from typing import Any
 import gsplat
 import pytest
 import torch
-from gsplat_stub import stub_gsplat
-from kill_and_resume import set_up
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from runs import ITERATIONS, configure, is_finite, train
 
+from helpers.gsplat_stub import stub_gsplat
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import ITERATIONS, configure, is_finite, train
 from sadgs_ns.cli import export
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError

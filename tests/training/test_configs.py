@@ -21,8 +21,8 @@ import yaml
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion, all_methods
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
-from processes import HANGS
 
+from helpers.forked_python import HANGS
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training import initial_gaussians, presets

@@ -10,10 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import processes
 import pytest
 import torch
-from kill_and_resume import differences, set_up
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -21,7 +19,11 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import entrypoint
 from nerfstudio.utils.eval_utils import eval_setup
 from plyfile import PlyData
-from runs import (
+
+from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers import forked_python
+from helpers.kill_and_resume import differences, set_up
+from helpers.short_runs import (
     ITERATIONS,
     SCHEDULE,
     TRAIN_VIEWS,
@@ -32,9 +34,7 @@ from runs import (
     nerfstudio_data,
     train,
 )
-from scenes import HEIGHT, POINTS, VIEWS, WIDTH
-
-from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.small_scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
@@ -510,7 +510,7 @@ def killed(state, path):
 torch.save = killed
 checkpoints.write(Path({str(trainer.checkpoint_dir)!r}), 2, {{}}, keep=False)
 """
-    assert processes.python(code).returncode == -9
+    assert forked_python.python(code).returncode == -9
     assert len(list(tmp_path.rglob("*.partial"))) == 1
     config.load_dir = trainer.checkpoint_dir
     resumed = set_up(config)

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from kill_and_resume import set_up
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts.render import DatasetRender
 from PIL import Image
-from runs import in_the_viewer
-from scenes import HEIGHT, WIDTH, camera
 
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import in_the_viewer
+from helpers.small_scenes import HEIGHT, WIDTH, camera
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import NORMALS, SadgsModel

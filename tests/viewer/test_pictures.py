@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scenes import camera, random_params
 
+from helpers.small_scenes import camera, random_params
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.viewer import color_scales, maps

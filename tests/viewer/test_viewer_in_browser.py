@@ -11,15 +11,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-import browser
 import pytest
-from browser import Page, open_page
-from kill_and_resume import configure, set_up
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
-from processes import HANGS
 
 from examples.drawn_scene.scene import write_scene
+from helpers import browser
+from helpers.browser import Page, open_page
+from helpers.forked_python import HANGS
+from helpers.kill_and_resume import configure, set_up
 from sadgs_ns.viewer.structure_panel import OUTPUT
 
 LABEL = "[...document.querySelectorAll('label')].filter(l => l.textContent == '{}')[0]"
