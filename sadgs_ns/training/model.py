@@ -25,6 +25,7 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.activations import activate
+from sadgs_ns.render.normals import normals_map
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
@@ -34,7 +35,6 @@ from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.parameter_average import RunningMean
-from sadgs_ns.viewer import maps
 from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 CAMERA_CLEARANCE = 2.0
@@ -271,14 +271,14 @@ class SadgsModel(SplatfactoModel):
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
         """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        They are 0.5 + 0.5 n with n of `maps.normals_map`, in the world's axes, and black where nothing is.
+        They are 0.5 + 0.5 n with n of `normals_map`, in the world's axes, and black where nothing is.
         `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
         pinhole = self.pinhole(camera)
         if not len(params["means"]):
             return torch.zeros((pinhole.height, pinhole.width, 3), device=self.device)
-        normals = maps.normals_map(params, pinhole, self.drawing)
+        normals = normals_map(params, pinhole, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]
