@@ -32,10 +32,10 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.parameter_average import RunningMean
-from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within this many of their standard deviations of a camera are dropped, unlike in the paper. That

@@ -33,10 +33,10 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import blending, rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
+from sadgs_ns.training.outputs import warn_once
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
-from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
