@@ -25,17 +25,17 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.activations import activate
+from sadgs_ns.render.normals import normals_map
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.parameter_average import RunningMean
-from sadgs_ns.viewer import maps
-from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within this many of their standard deviations of a camera are dropped, unlike in the paper. That
@@ -177,12 +177,24 @@ class SadgsModel(SplatfactoModel):
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
 
-    def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
+    def shown_rows(self, chosen: Tensor | None = None) -> Tensor | None:
+        """Return which Gaussians are drawn: the chosen ones that lie in the viewer's crop box. bool [N]
+
+        None stands for all Gaussians, in the argument and in the result. In training, the box hides nothing.
+        """
         if self.crop_box is None or self.training:
-            return values
+            return chosen
         inside = self.crop_box.within(self.means)
-        return {name: value[inside] for name, value in values.items()}
+        if chosen is None:
+            return inside
+        return chosen & inside
+
+    def cropped(self, values: Mapping[str, Tensor], chosen: Tensor | None = None) -> Mapping[str, Tensor]:
+        """Return the rows of tensors [N, …] of the Gaussians that are drawn, as `shown_rows` chooses them."""
+        rows = self.shown_rows(chosen)
+        if rows is None:
+            return values
+        return {name: value[rows] for name, value in values.items()}
 
     @property
     def backend(self) -> str:
@@ -201,22 +213,28 @@ class SadgsModel(SplatfactoModel):
         degree = min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
         return replace(self.drawing, sh_degree=degree, **changes)
 
-    def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def render(
+        self, cameras: Pinholes, options: RenderOptions, chosen: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
 
-        Returns unclamped colours, with depth if `options` ask for it [C, H, W, 3 or 4], accumulated opacity
-        [C, H, W, 1], and the rasterizer's info.
+        `chosen`, bool [N], leaves out all others. Returns unclamped colours, with depth if `options` ask for it
+        [C, H, W, 3 or 4], accumulated opacity [C, H, W, 1], and the rasterizer's info.
         """
-        return rasterize(self.gaussians()[0], cameras, options)
+        gaussians, _ = self.gaussians(chosen=chosen)
+        return rasterize(gaussians, cameras, options)
 
     def gaussians(
-        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
+        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0, chosen: Tensor | None = None
     ) -> tuple[Gaussians, Tensor | None]:
         """Return the activated Gaussians inside the viewer's crop box, of `params` or the model's own.
 
-        The second result are numbers [P] whose sum is the mean opacity times `opacity_reg`; None if that factor is 0.
+        `chosen`, bool [N], leaves out all others. The second result are numbers [P] whose sum is the mean opacity
+        times `opacity_reg`; None if that factor is 0.
         """
-        params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
+        if params is None:
+            params = dict(self.gauss_params.items())
+        params = self.cropped(params, chosen)
         colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
         if self.config.sh_degree == 0:
             colors = torch.sigmoid(params["features_dc"])  # [N, 3]
@@ -241,8 +259,12 @@ class SadgsModel(SplatfactoModel):
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+    def get_outputs(self, camera: Cameras, chosen: Tensor | None = None) -> dict[str, Any]:
         """Render one camera, shape [1], for viewer and evaluation. Raise InputError if it is no pinhole.
+
+        Args:
+            camera: The camera.
+            chosen: Which Gaussians to draw; those outside the viewer's crop box are left out anyway. bool [N]
 
         Returns:
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
@@ -250,9 +272,10 @@ class SadgsModel(SplatfactoModel):
         """
         check_camera_types(camera)
         pinhole, background = self.pinhole(camera), self.background
-        if self.crop_box is not None and not self.crop_box.within(self.means).any():
+        rows = self.shown_rows(chosen)
+        if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
-        render, alpha, _ = self.render(pinhole, self.color_options(expected_depth=True))
+        render, alpha, _ = self.render(pinhole, self.color_options(expected_depth=True), chosen)
         depth = render[..., 3:4]
         return {
             "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
@@ -271,14 +294,14 @@ class SadgsModel(SplatfactoModel):
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
         """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        They are 0.5 + 0.5 n with n of `maps.normals_map`, in the world's axes, and black where nothing is.
+        They are 0.5 + 0.5 n with n of `normals_map`, in the world's axes, and black where nothing is.
         `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
         pinhole = self.pinhole(camera)
         if not len(params["means"]):
             return torch.zeros((pinhole.height, pinhole.width, 3), device=self.device)
-        normals = maps.normals_map(params, pinhole, self.drawing)
+        normals = normals_map(params, pinhole, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -87,13 +86,8 @@ class CleaningPanel(torch.nn.Module):
         model, stays = self._views.model, self._stays
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
-        box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays
-        drawn = drawn if box is None else drawn & box.within(model.means)
-        model.crop_box = SimpleNamespace(within=lambda means: drawn)  # type: ignore[assignment]
-        try:
-            return {OUTPUT: model.get_outputs(camera)["rgb"]}
-        finally:
-            model.crop_box = box
+        drawn = stays if self._shown == STAYS else ~stays
+        return {OUTPUT: model.get_outputs(camera, drawn)["rgb"]}
 
 
 def command_line_options(cleaning: Cleaning) -> str:

@@ -30,13 +30,13 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.growth import structure_aware
 from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render import rasterization
+from sadgs_ns.render import blending, rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
+from sadgs_ns.training.outputs import warn_once
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
-from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -345,7 +345,7 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         rendered.append(len(gaussians.means))
         return rasterization.rasterize(gaussians, *args)
 
-    monkeypatch.setattr(maps, "rasterize", rasterize)
+    monkeypatch.setattr(blending, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
