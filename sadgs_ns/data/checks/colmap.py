@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data import colmap
-from sadgs_ns.data.checks import images, layouts
+from sadgs_ns.data import colmap, images
+from sadgs_ns.data.checks import layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
 from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
+from sadgs_ns.data.checks.images import check_images
 from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.text import read_text
@@ -53,7 +54,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
             size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
             mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
             frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
-        yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
+        yield from check_images(frames, poses_path, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
-from sadgs_ns.data.checks.images import read_small
+from sadgs_ns.data.images import read_small
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.checks.images import Rounding, images_in
+from sadgs_ns.data.images import Rounding, images_in
 from sadgs_ns.errors import InputError
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")  # Places of a reconstruction, nerfstudio's first

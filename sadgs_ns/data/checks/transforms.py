@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data import IMAGE_SUFFIXES, colmap
-from sadgs_ns.data.checks import geometry, images
+from sadgs_ns.data import colmap, images
+from sadgs_ns.data.checks import geometry
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
+from sadgs_ns.data.checks.images import check_images
 from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
@@ -66,7 +67,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         remedy = "name each as mask_path of its frame to leave out what is black in it"
         yield warning(f"{folder / 'masks'} holds masks that are not used, as {path} names none: {remedy}.")
     if open_images:
-        yield from images.check_images(frames, path, look_for_unused=factor == 1)
+        yield from check_images(frames, path, look_for_unused=factor == 1)
     if options.load_3D_points:
         yield from _check_ply(meta, path, views if sound else [])
 
@@ -129,7 +130,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         else:
             yield from geometry.check_rotations(views)
         if open_images:
-            yield from images.check_images([images.Frame(image, size if any(size) else None) for image in paths], path)
+            yield from check_images([images.Frame(image, size if any(size) else None) for image in paths], path)
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
@@ -172,7 +173,9 @@ def _completed(frame: dict[str, Any], meta: dict[str, Any], path: Path) -> dict[
 
 def mended_name(folder: Path, name: str) -> str:
     """Return the name of a file in a folder that lacks its suffix or was written with backslashes, as it is there."""
-    names = (start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(IMAGE_SUFFIXES)))
+    names = (
+        start + suffix for start in (name, name.replace("\\", "/")) for suffix in ("", *sorted(images.IMAGE_SUFFIXES))
+    )
     return next((found for found in names if (folder / found).is_file()), name)
 
 
