@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
-from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
+from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, check_findings, unreadable
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_transforms
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.data.images import mask_name
+from sadgs_ns.data.layouts import COLMAP_FOLDERS, ParserOptions, automatic_options, layout_of
 from sadgs_ns.errors import InputError
 
 _FAR = 10.0  # Distance of cameras from the origin, in their extents, from which `_centre` moves them

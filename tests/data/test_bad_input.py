@@ -46,8 +46,8 @@ from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap, parsers
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import Finding, check_findings
-from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError, RunError
 
 CHECKOUT = Path(__file__).parents[2]

@@ -15,9 +15,10 @@ from sadgs_ns.data import colmap, images
 from sadgs_ns.data.checks import geometry
 from sadgs_ns.data.checks.findings import Finding, collect_findings, note, warning
 from sadgs_ns.data.checks.images import check_images
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, GIVE_POSES, ParserOptions, no_layout
+from sadgs_ns.data.checks.layouts import GIVE_POSES, no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
+from sadgs_ns.data.layouts import COLMAP_FOLDERS, ParserOptions
 from sadgs_ns.data.text import read_text
 from sadgs_ns.errors import InputError, reason
 
