@@ -27,10 +27,11 @@ from torch import Tensor
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, check_findings, unreadable
-from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_transforms
+from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.data.images import mask_name
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, ParserOptions, automatic_options, layout_of
+from sadgs_ns.data.transforms import read_blender, read_transforms
 from sadgs_ns.errors import InputError
 
 _FAR = 10.0  # Distance of cameras from the origin, in their extents, from which `_centre` moves them

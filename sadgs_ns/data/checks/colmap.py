@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap, images, layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
-from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
+from sadgs_ns.data.checks.geometry import check_points, check_views
 from sadgs_ns.data.checks.images import check_images
 from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.layouts import ParserOptions, automatic_options
 from sadgs_ns.data.text import read_text
+from sadgs_ns.data.views import Camera, View, check_positive
 from sadgs_ns.errors import InputError
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's camera models that nerfstudio cannot read

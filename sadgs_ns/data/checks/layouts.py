@@ -8,6 +8,7 @@ from pathlib import Path
 from sadgs_ns.data import colmap
 from sadgs_ns.data.images import images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
+from sadgs_ns.data.transforms import GIVE_POSES
 
 _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
@@ -26,7 +27,6 @@ _EXPORTS = {
     "bundle.out": (b"# Bundle", _BUNDLER),
 }
 """Files with other programs' poses, a part of their content, and the command that reads them."""
-GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"  # A remedy where there are none
 
 
 def poses_elsewhere(data: Path) -> str | None:
