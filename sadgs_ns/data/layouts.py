@@ -13,7 +13,7 @@ from typing import Literal
 
 from sadgs_ns.data import colmap, images
 from sadgs_ns.data.images import Rounding
-from sadgs_ns.errors import InputError
+from sadgs_ns.errors import InputError, reason
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")  # Places of a reconstruction, nerfstudio's first
 
@@ -102,3 +102,8 @@ def automatic_options(data: Path) -> ParserOptions:
     factor = images.automatic_factor(image, copies)
     rounding = images.rounding_of(image, copies(factor), factor)
     return dataclasses.replace(options, downscale_factor=factor, downscale_rounding_mode=rounding)
+
+
+def unreadable(error: OSError) -> str:
+    """Return the sentence for a folder that may not be entered, or a name that is too long to be one."""
+    return f"{error.filename} cannot be read ({reason(error)}): correct its name or rights."

@@ -12,7 +12,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.data.parsers import check_capture, keep_findings
+from sadgs_ns.data.checks.capture import check_capture, keep_findings
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
 from sadgs_ns.training.run import checkpoints, processes
