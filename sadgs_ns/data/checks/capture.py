@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -30,24 +30,53 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
 
     Return the findings that do not stop training; raise InputError with the first that does, and as `choose_parser`.
     """
-    vars(config).pop("findings", None)
     choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
     names = [field.name for field in fields(ParserOptions) if hasattr(parser, field.name)]
     options = ParserOptions(**{name: getattr(parser, name) for name in names})
-    checks = [check for kind, check in CHECKS.items() if isinstance(parser, kind)]
-    findings = checks[0](data, options, open_images) if checks else []
-    check_findings(findings, data)
-    return findings
+    for kind, check in CHECKS.items():
+        if isinstance(parser, kind):
+            findings = check(data, options, open_images)
+            check_findings(findings, data)
+            return findings
+    return []
 
 
-def keep_findings(config: FullImageDatamanagerConfig, findings: list[Finding]) -> None:
-    """Keep what `check_capture` found with these settings, which `findings_of` then returns once without a check."""
-    vars(config)["findings"] = copy.deepcopy(config), findings
+@dataclass(frozen=True)
+class _CheckAhead:
+    """A check at the start of a run, whose findings wait for the pipeline of the same run."""
+
+    config: FullImageDatamanagerConfig  # The settings that were checked
+    settings: FullImageDatamanagerConfig  # A copy of them as they were then, which shows whether they have changed
+    findings: list[Finding]
+
+
+_ahead: _CheckAhead | None = None
+
+
+def check_ahead(config: FullImageDatamanagerConfig) -> None:
+    """Check a capture at the start of a run, and keep the findings for `findings_of`; raises as `check_capture`.
+
+    nerfstudio makes a pipeline of its settings alone. The findings are no settings, and `config.yml` must not hold
+    them, so they are kept here. A process that did not check ahead, as one of several devices, checks for itself.
+    """
+    global _ahead
+    _ahead = None
+    findings = check_capture(config)
+    _ahead = _CheckAhead(config, copy.deepcopy(config), findings)
 
 
 def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
-    """Return the findings that were kept in these settings, or else those of `check_capture`."""
-    checked, findings = vars(config).pop("findings", (None, []))
-    return findings if checked == config else check_capture(config, open_images)
+    """Return the findings on a capture; raises as `check_capture`.
+
+    They are those of `check_ahead`, if it checked these settings, they have not changed and nobody asked before.
+    """
+    global _ahead
+    ahead = _ahead
+    if ahead is None or ahead.config is not config:
+        return check_capture(config, open_images)
+    _ahead = None
+    if ahead.settings != config:
+        return check_capture(config, open_images)
+    return ahead.findings
