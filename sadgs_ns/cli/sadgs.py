@@ -29,8 +29,8 @@ from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
-from sadgs_ns.data.checks.layouts import find_cameras
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
+from sadgs_ns.data.layouts import find_cameras
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d

@@ -1,11 +1,10 @@
-"""nerfstudio's parsers: which one fits a capture, the check of its data, and the changes that this package makes."""
+"""nerfstudio's parsers: which one fits a capture, and the changes that this package makes."""
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest import mock
@@ -25,12 +24,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
-from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
-from sadgs_ns.data.checks.findings import Finding, check_findings, unreadable
-from sadgs_ns.data.checks.images import mask_name
-from sadgs_ns.data.checks.layouts import COLMAP_FOLDERS, ParserOptions, layout_of
-from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio, read_blender, read_transforms
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
+from sadgs_ns.data.images import mask_name
+from sadgs_ns.data.layouts import COLMAP_FOLDERS, automatic_options, layout_of, unreadable
+from sadgs_ns.data.transforms import read_blender, read_transforms
 from sadgs_ns.errors import InputError
 
 _FAR = 10.0  # Distance of cameras from the origin, in their extents, from which `_centre` moves them
@@ -56,13 +53,6 @@ else:
     ]
     """The union that tyro turns into subcommands, as nerfstudio does with its own parsers."""
 
-CHECKS = {
-    ColmapDataParserConfig: check_colmap,
-    NerfstudioDataParserConfig: check_nerfstudio,
-    BlenderDataParserConfig: check_blender,
-}
-"""The check of each parser's data; other parsers' data are not checked."""
-
 
 def choose_parser(config: FullImageDatamanagerConfig) -> None:
     """Replace the automatic parser by one that fits, which `config.yml` names; raise InputError for unreadable data."""
@@ -81,34 +71,6 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
         config.dataparser = ColmapDataParserConfig(data=data, **{name: options[name] for name in chosen})
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)
-
-
-def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
-    """Choose the parser if none was named, and check the data before nerfstudio parses them.
-
-    Return the findings that do not stop training; raise InputError with the first that does, and as `choose_parser`.
-    """
-    vars(config).pop("findings", None)
-    choose_parser(config)
-    parser = config.dataparser
-    data = Path(config.data or parser.data)
-    names = [field.name for field in fields(ParserOptions) if hasattr(parser, field.name)]
-    options = ParserOptions(**{name: getattr(parser, name) for name in names})
-    checks = [check for kind, check in CHECKS.items() if isinstance(parser, kind)]
-    findings = checks[0](data, options, open_images) if checks else []
-    check_findings(findings, data)
-    return findings
-
-
-def keep_findings(config: FullImageDatamanagerConfig, findings: list[Finding]) -> None:
-    """Keep what `check_capture` found with these settings, which `findings_of` then returns once without a check."""
-    vars(config)["findings"] = copy.deepcopy(config), findings
-
-
-def findings_of(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
-    """Return the findings that were kept in these settings, or else those of `check_capture`."""
-    checked, findings = vars(config).pop("findings", (None, []))
-    return findings if checked == config else check_capture(config, open_images)
 
 
 class _PointsOfPly:

@@ -14,7 +14,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
-from sadgs_ns.data.parsers import findings_of
+from sadgs_ns.data.checks.capture import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

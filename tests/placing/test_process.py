@@ -41,8 +41,8 @@ from rich.progress import Progress
 from helpers.drawn_photos import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
 from sadgs_ns.cli import process as program
 from sadgs_ns.cli.process import Process, Scene, main, process
-from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing import features, reconstruct
 from sadgs_ns.placing.colmap import make_model, start_colmap
