@@ -1026,13 +1026,13 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
 )
 def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
-    imports = "import sys; from sadgs_ns.cli.cameras import command"
+    imports = "import sys; from sadgs_ns.cli import process"
     code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_features_are_found_while_torch_is_imported():
-    imports = "import sys; from sadgs_ns.cli.cameras import reconstruct"
+    imports = "import sys; from sadgs_ns.placing import reconstruct"
     subprocess.run([sys.executable, "-c", f"{imports}; assert 'torch' not in sys.modules"], check=True)
 
 
