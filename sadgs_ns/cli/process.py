@@ -23,10 +23,11 @@ import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sadgs_ns import events
-from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
+from sadgs_ns.cli.program import exit_code, parse
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
+from sadgs_ns.files import locked, read_settings, write_json
 from sadgs_ns.interrupts import Interrupts
 from sadgs_ns.placing.colmap import Report, make_model, start_colmap
 from sadgs_ns.placing.folder import find_source, find_videos

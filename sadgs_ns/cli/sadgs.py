@@ -25,13 +25,14 @@ from rich.console import Console
 
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.process import Process, Scene, check_size
-from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
+from sadgs_ns.cli.program import exit_code, parse
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
 from sadgs_ns.data.checks.layouts import find_cameras
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.files import locked, read_settings, write_json
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe

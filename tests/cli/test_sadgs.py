@@ -24,10 +24,10 @@ from helpers.forked_python import HANGS
 from helpers.short_runs import nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.program import locked
 from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
+from sadgs_ns.files import locked
 from sadgs_ns.placing.plan import Summary
 
 TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
