@@ -24,7 +24,7 @@ import tyro
 from rich.console import Console
 
 from sadgs_ns.cli.export import Export
-from sadgs_ns.cli.process import Process, Scene, check_size
+from sadgs_ns.cli.process import Process
 from sadgs_ns.cli.program import exit_code, parse
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
 from sadgs_ns.data.checks import check_data
@@ -38,8 +38,10 @@ from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.folder import images_of
+from sadgs_ns.placing.options import check_size
 from sadgs_ns.placing.photos import changes_of, photo_stamps
 from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
 
