@@ -39,9 +39,9 @@ from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.folder import images_of
 from sadgs_ns.placing.options import check_size
-from sadgs_ns.placing.photos import changes_of, photo_stamps
 from sadgs_ns.placing.plan import Summary
 from sadgs_ns.placing.scene import Scene
+from sadgs_ns.placing.stamps import changes_of, photo_stamps
 from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
 

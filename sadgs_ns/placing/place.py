@@ -6,19 +6,23 @@ import contextlib
 import dataclasses
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.placing.colmap import Report, make_model, start_colmap
-from sadgs_ns.placing.conversion import Say, convert
+from sadgs_ns.placing.conversion import convert_photos, write_alpha, write_masks
 from sadgs_ns.placing.folder import find_videos
 from sadgs_ns.placing.options import PlacingOptions
 from sadgs_ns.placing.panoramas import VIEWS
-from sadgs_ns.placing.photos import Photo, empty_folder, photo_stamps, photos_by_camera, read_photos
+from sadgs_ns.placing.photos import Photo, empty_folder, photos_by_camera, read_photos
 from sadgs_ns.placing.plan import Summary, choose_matching
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.scene import Scene
+from sadgs_ns.placing.stamps import photo_stamps
 from sadgs_ns.placing.video import video_frames, write_frames
+
+Say = Callable[..., None]  # Called with an event, a sentence on it, and by keyword the fields of the event
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +91,7 @@ def _make(scene: Scene, report: Report, say: Say) -> Summary:
             for path in (scene.model, work / "photos"):
                 shutil.rmtree(path, ignore_errors=True)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
-        folder, photos = convert(scene, folder, photos, say)
+        folder, photos = _convert(scene, folder, photos, say)
         photos = [photo for photo in photos if photo.camera]  # without the views
         groups = [[photo.name] for photo in photos] if options.camera_per_photo else photos_by_camera(photos)
         arguments = (folder, groups, matching, options.max_size, scene.model, scene.base, rigs)
@@ -112,3 +116,19 @@ def _tell_work(scene: Scene, photos: Sequence[Photo], say: Say) -> None:
             f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
             f"leave out 30° about the zenith and the nadir; {held_out} are held out.",
         )
+
+
+def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> tuple[Path, list[Photo]]:
+    """Convert photos as `convert_photos`, and write their opacities, and masks if they or the scene have any."""
+    work, masks = scene.work, scene.masks
+    converted, photos = convert_photos(folder, stored, work / "photos")
+    has_masks = (scene.options.out / "masks").exists() if scene.added else bool(masks)
+    shutil.rmtree(work / "masks", ignore_errors=True)
+    if has_masks:
+        write_masks(scene.options.source, masks, stored, photos, work / "masks")
+    if masks:
+        why = "used" if has_masks else "not used, because the scene has none: give another folder for it"
+        say("aside", f"Masks of {len(masks)} photos are {why}.")
+    if transparent := write_alpha(converted, photos, work / "alpha"):
+        say("transparent", f"{transparent} photos are partly transparent; their images in the scene are, too.")
+    return converted, photos

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from sadgs_ns.data.coordinates import FRAME_KEYS
 from sadgs_ns.errors import InputError, WriteError
-from sadgs_ns.placing.photos import read_photos, restore_alpha
+from sadgs_ns.placing.conversion import restore_alpha
+from sadgs_ns.placing.photos import read_photos
 
 _KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")  # Kept when photos are added
 

@@ -12,7 +12,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.files import locked, read_settings, write_json
 from sadgs_ns.placing.folder import find_source
 from sadgs_ns.placing.options import PlacingOptions
-from sadgs_ns.placing.photos import changes_of
+from sadgs_ns.placing.stamps import changes_of
 
 _UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "undistorted")  # Made anew by each run
 

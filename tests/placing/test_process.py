@@ -46,8 +46,9 @@ from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing import features, place, reconstruct
 from sadgs_ns.placing.colmap import make_model, start_colmap
+from sadgs_ns.placing.conversion import convert_photos, write_masks
 from sadgs_ns.placing.folder import find_source, look_into
-from sadgs_ns.placing.photos import Photo, convert_photos, photos_by_camera, read_photos, write_masks
+from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
 from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
