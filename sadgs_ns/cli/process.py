@@ -19,10 +19,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sadgs_ns import events
 from sadgs_ns.cli.program import exit_code, parse
-from sadgs_ns.errors import InputError
 from sadgs_ns.interrupts import Interrupts
-from sadgs_ns.placing.colmap import Report
-from sadgs_ns.placing.options import PlacingOptions, check_size
+from sadgs_ns.placing.options import PlacingOptions, Report
 from sadgs_ns.placing.place import place_photos
 from sadgs_ns.placing.plan import Matching, Summary
 
@@ -79,13 +77,16 @@ def _reporter(progress: Progress) -> Report:
     def report(stage: str, done: int, total: int) -> None:
         nonlocal printed
         events.progress(stage, done, total)
-        progress.start()  # Before any stage there is nothing to show.
-        if begins := stage not in tasks:
+        progress.start()  # Before the first stage there is nothing to show.
+        begins = stage not in tasks
+        if begins:
             tasks[stage] = progress.add_task(stage, total=total)
         progress.update(tasks[stage], completed=done)
-        if progress.disable and (begins or done == total or time.monotonic() >= printed + _SECONDS_PER_LINE):
-            print(f"{stage} {done}/{total}", flush=True)
-            printed = time.monotonic()
+        if progress.disable:
+            is_due = time.monotonic() >= printed + _SECONDS_PER_LINE
+            if begins or done == total or is_due:
+                print(f"{stage} {done}/{total}", flush=True)
+                printed = time.monotonic()
 
     return report
 
@@ -97,18 +98,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(options: Process) -> int:
-    if options.frames < 3:
-        raise InputError("--frames must be at least 3.")
-    check_size(options.max_size)
-    summary, out = process(options), shlex.quote(str(options.out))
+    summary = process(options)
+    out = shlex.quote(str(options.out))
     if not summary.is_poor:
         print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
         return 0
-    again = "the same command with --matching exhaustive, which uses the features found so far; or "
+    remedy = "another folder with more photos between those that did not register, with two thirds of overlap"
+    if summary.matching != "exhaustive":
+        remedy = f"the same command with --matching exhaustive, which uses the features found so far; or {remedy}"
     print(
-        f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try "
-        f"{again * (summary.matching != 'exhaustive')}another folder with more photos between those that did not "
-        f"register, with two thirds of overlap. This trains on what is there: ns-train sadgs --data {out}",
+        f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try {remedy}. "
+        f"This trains on what is there: ns-train sadgs --data {out}",
         file=sys.stderr,
     )
     return 1
