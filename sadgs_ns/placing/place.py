@@ -62,7 +62,7 @@ def place_photos(options: PlacingOptions, report: Report, say: Say) -> Placed:
 
 
 def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
-    # The process of COLMAP starts at once, to import what it needs while photos are read, and ends before the lock does.
+    # COLMAP's process starts at once, to import what it needs while photos are read, and ends before the lock does.
     with contextlib.ExitStack() as lock, start_colmap() as colmap:
         if scene.is_video:
             folder = scene.work / "frames"
