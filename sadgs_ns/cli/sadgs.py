@@ -16,65 +16,41 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import tyro
 from rich.console import Console
 
 from sadgs_ns.cli.export import Export
-from sadgs_ns.cli.process import Process, Scene, check_size
-from sadgs_ns.cli.program import exit_code, locked, parse, read_settings, write_json
+from sadgs_ns.cli.process import Process
+from sadgs_ns.cli.program import exit_code, parse
+from sadgs_ns.cli.sadgs_options import (
+    FORMAT_NAMES,
+    SET_OPTIONS,
+    Sadgs,
+    choose_formats,
+    find_given_cameras,
+    with_dashes,
+)
 from sadgs_ns.cli.status_line import StatusLine, Timeline, clock
-from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.findings import check_findings
 from sadgs_ns.data.coordinates import FRAME_KEYS, TRANSFORMS_NAME
 from sadgs_ns.data.layouts import find_cameras
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.formats import FORMATS, MESH
-from sadgs_ns.formats.mesh import load_open3d
+from sadgs_ns.files import locked, read_settings, write_json
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.folder import images_of
-from sadgs_ns.placing.photos import changes_of, photo_stamps
+from sadgs_ns.placing.options import check_size
 from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.scene import Scene
+from sadgs_ns.placing.stamps import changes_of, photo_stamps
 from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
 
-_OURS = ("data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config")
-"""Options of ns-train that this command sets."""
 _TRAINING, _EXPORT = "sadgs_ns.training.run.start:train", "sadgs_ns.cli.exporting:export_all"
 _LOCK_SECONDS = 10.0  # Time in which the last stage of a killed run may save
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
 """Stage and part of the time that begin with a stage, if others than itself."""
-_FORMATS = [suffix[1:] for suffix in (*FORMATS, MESH)]
-
-
-@dataclass
-class Sadgs:
-    """From photos or a video to a splat that opens in a browser: cameras (sadgs-process), training (ns-train sadgs) and
-    export (sadgs-export), each of which is a command of its own, too. Run it again to resume; nothing is done twice.
-    Options after -- go to ns-train, as in `sadgs photos -- --max-num-iterations 500`; `sadgs -- --help` lists them."""
-
-    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="PHOTOS_OR_VIDEO")]
-    """Folder of photos or of videos, or a video."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None
-    """Folder for all results; by default the source's name and -splat, in the working directory."""
-    effort: Annotated[float, tyro.conf.arg(metavar="X")] = 1.0
-    """How much training: 0.5 is a draft, 2 resolves more."""
-    cameras: Literal["given", "new"] = "given"
-    """Use the folder's cameras, a COLMAP model or transforms.json, if it has any, or find new ones."""
-    max_size: Annotated[int, tyro.conf.arg(metavar="PX")] = 1600
-    """Longest side of the photos, at least 64, 0 to keep it."""
-    formats: Annotated[
-        str | None,
-        tyro.conf.arg(metavar="A,B", help=f"Formats to export, of {', '.join(_FORMATS)}; by default html,ply."),
-    ] = None
-    anyway: bool = False
-    """Continue even if fewer than half of the photos registered."""
-    profile: bool = False
-    """Also print where the time went as a table."""
 
 
 class PhotosToSplat:
@@ -85,8 +61,8 @@ class PhotosToSplat:
         name = f"{(source.name if source.is_dir() else source.stem) or 'photos'}-splat"
         self.source, self.folder = options.source, options.output or Path(name)
         self.options, self.train_options, self.console = options, train_options, console
-        self._formats = sorted(_formats(options.formats, console), key=lambda name: name == "html")
-        self._camera_file = _cameras_of(options, train_options)
+        self._formats = sorted(choose_formats(options.formats, console), key=lambda name: name == "html")
+        self._camera_file = find_given_cameras(options, train_options)
         self._scene, self._runs = self.folder / "scene", self.folder / "training" / "sadgs"
         self._data = self.source if self._camera_file else self._scene
         self._capture = self.source if source.is_dir() else self.source.parent
@@ -97,7 +73,7 @@ class PhotosToSplat:
         check_size(options.max_size)
         for option in train_options:
             name = option.partition("=")[0].lstrip("-").replace("_", "-")
-            if option.startswith("--") and name in _OURS:
+            if option.startswith("--") and name in SET_OPTIONS:
                 raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
         self._read_settings()
         for path in (self.source, self.folder):
@@ -292,7 +268,7 @@ class PhotosToSplat:
             if event == "training begins":
                 total = f"{fields['iterations']:,}"
             elif event == "warning":
-                line.print(_dashed(fields["told"], self.train_options))
+                line.print(with_dashes(fields["told"], self.train_options))
             elif event == "iteration":
                 # Meanwhile it imports what export needs.
                 self._exporter = self._exporter or self.worker("export", _EXPORT)
@@ -324,7 +300,7 @@ class PhotosToSplat:
 
     def _export(self, line: StatusLine) -> str:
         checkpoint, jobs, told = self._checkpoint(), [], []
-        outputs = {name: self.folder / f"splat.{name}" for name in (*self._formats, *_FORMATS)}
+        outputs = {name: self.folder / f"splat.{name}" for name in (*self._formats, *FORMAT_NAMES)}
         for name, output in outputs.items():
             if checkpoint and output.is_file() and output.stat().st_mtime >= checkpoint.stat().st_mtime:
                 told += [f"{output}; done before"] if name in self._formats else []
@@ -360,47 +336,8 @@ STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {
 before, updates its line, and returns the line's last sentence. It may raise InputError and RunError."""
 
 
-def _dashed(sentence: str, train_options: Sequence[str]) -> str:
-    """Return a sentence on the end of a command of `ns-train` as it is for this one."""
-    return sentence.replace("end the command with `", "end the command with `" + "-- " * (not train_options))
-
-
-def _cameras_of(options: Sadgs, train_options: Sequence[str]) -> Path | None:
-    """Return the file of the source's cameras, or None; raise InputError if they cannot be trained on."""
-    try:
-        if options.cameras == "new" or (file := find_cameras(options.source)) is None:
-            return None
-        # Training checks what a parser reads that is named.
-        if {"colmap", "nerfstudio-data", "blender-data"}.isdisjoint(train_options):
-            check_findings(check_data(options.source), options.source)
-    except InputError as error:
-        told = _dashed(str(error).rstrip("."), train_options)
-        raise InputError(f"{told}; or find new cameras with --cameras new.") from None
-    if options.max_size != Sadgs.max_size:
-        smaller = "or for images of half the size `-- --pipeline.datamanager.camera-res-scale-factor 0.5` at the end"
-        raise InputError(f"--max-size is for new cameras, and those of {file} are used: leave it out, {smaller}.")
-    return file
-
-
 def _shown(value: Any) -> str:
     return (shlex.join(value) or "none") if isinstance(value, list) else str(value)
-
-
-def _formats(asked: str | None, console: Console) -> list[str]:
-    """Return the formats to export; raise InputError for an unknown one, or for a page without Node.js."""
-    has_node = shutil.which("npx") is not None
-    if asked is None:
-        if not has_node:
-            console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
-        return ["html", "ply"] if has_node else ["ply"]
-    chosen = list(dict.fromkeys(asked.split(",")))
-    if unknown := [name for name in chosen if name not in _FORMATS]:
-        raise InputError(f"--formats knows {', '.join(_FORMATS)}, and not {unknown[0]!r}.")
-    if "html" in chosen and not has_node:
-        raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
-    if MESH[1:] in chosen:
-        load_open3d()  # It may be missing, which the user shall know before cameras are found.
-    return chosen
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -23,11 +23,13 @@ from helpers.captures import LAYOUTS, Capture, write_capture
 from helpers.drawn_photos import draw_photos
 from helpers.forked_python import HANGS
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.program import locked
-from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
+from sadgs_ns.cli.sadgs import PhotosToSplat, main
+from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
+from sadgs_ns.files import locked
 from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.stamps import photo_stamps
 
 TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
 """More Gaussians take a second a step."""
@@ -420,6 +422,45 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
         assert main(arguments) == 130
     commands.clear()
     assert main(arguments) == 0 and commands[0][0] == "ns-train"
+
+
+@pytest.mark.hard_case(
+    "a folder that an earlier version of `sadgs` began", "nothing is done again; other options are refused, as ever"
+)
+def test_settings_that_an_earlier_version_wrote_are_read(
+    photos: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    """Two files as version 1.0 writes them. The keys are names of options or of what was done."""
+    out, names = tmp_path / "out", sorted(path.name for path in photos.iterdir())
+    views = [f"images/{name}" for name in names]
+    scene = {
+        "source": str(photos.resolve()), "photos": names, "camera_per_photo": False, "max_size": 120, "model": "model",
+        "files": photo_stamps(photos, names), "finished": dataclasses.asdict(Summary(10, 4, 99, 0.5, {}, "exhaustive")),
+    }  # fmt: skip
+    settings = {
+        "source": str(photos.resolve()), "--cameras": "new", "--max-size": 120, "--effort": 0.5,
+        "options of ns-train": ["--max-num-iterations", "8"], "views": views, "run": "run-10",
+        "few": "4 of 10 photos registered", "trained": "8 iterations, 3 Gaussians",
+    }  # fmt: skip
+    checkpoint = out / "training" / "sadgs" / "run-10" / "nerfstudio_models" / "step-000000007.ckpt"
+    for path in (checkpoint, out / "scene" / "work" / "settings.json"):
+        path.parent.mkdir(parents=True)
+    checkpoint.touch()
+    (out / "scene" / "work" / "settings.json").write_text(json.dumps(scene))
+    (out / "scene" / "transforms.json").write_text(json.dumps({"frames": [{"file_path": name} for name in views]}))
+    (out / "settings.json").write_text(json.dumps(settings))
+    command = [str(photos), "-o", str(out), "--formats", "ply", "--max-size", "120"]
+    options = ["--", "--max-num-iterations", "8"]
+    assert main([*command, "--effort", "0.5", *options]) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert lines["cameras"] == "4 of 10 photos registered; done before"
+    assert lines["training"] == "8 iterations, 3 Gaussians; done before"
+    assert [words[0] for words in commands] == ["sadgs-export"] and checkpoint.exists()
+    assert json.loads((out / "settings.json").read_text()).items() >= settings.items(), "that version reads it, too"
+    assert main([*command, "--effort", "1", *options]) == 2
+    assert "(--effort was 0.5, is 1.0); give another --output or delete it." in capsys.readouterr().err
+    assert main([*command, "--effort", "0.5"]) == 2
+    assert "(options of ns-train was --max-num-iterations 8, is none); give" in capsys.readouterr().err
 
 
 @pytest.mark.hard_case(

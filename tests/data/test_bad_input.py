@@ -33,14 +33,8 @@ from torch import Tensor
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.drawn_photos import color_profile
 from helpers.forked_python import HANGS
-from helpers.short_runs import (
-    blender_data,
-    configure,
-    is_finite,
-    nerfstudio_data,
-    set_up,
-    train,
-)
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import blender_data, configure, is_finite, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap

@@ -24,7 +24,8 @@ from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from helpers.short_runs import configure, is_finite, set_up
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import configure, is_finite
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns import kernels
 from sadgs_ns.distributed.ranking import limit_growth
