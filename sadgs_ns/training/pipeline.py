@@ -117,9 +117,9 @@ class SadgsPipeline(VanillaPipeline):
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {near_plane:.2g} to {FAR_PLANE:g} units and the "
-                f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
-                "leave its auto-scale-poses on."
+                f"The renderings would be empty, since a camera sees from {near_plane:.2g} to {FAR_PLANE:g} units and "
+                f"the cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, "
+                "or leave its auto-scale-poses on."
             )
 
     def _report_nonfinite(self, last: bool = False) -> None:
