@@ -57,8 +57,11 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         loads_images = config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference"
-        if loads_images and (line := choose_image_storage(self.datamanager, self.device)):
-            note(line)
+        if loads_images:
+            storage = choose_image_storage(self.datamanager, self.device)
+            self.datamanager.config.cache_images = storage.where  # type: ignore[assignment]
+            if storage.sentence:
+                note(storage.sentence)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             told = f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}"
