@@ -19,9 +19,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
 from sadgs_ns.geometry.initialization import camera_extent, neighbour_scales
-from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
-from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.activations import activate
@@ -50,6 +48,7 @@ class SadgsModel(SplatfactoModel):
 
     config: SadgsModelConfig
     strategy: StructureAwareStrategy
+    plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
 
     def populate_modules(self) -> None:
@@ -67,7 +66,6 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
-        self.near_plane = config.near_plane or NEAR_PLANE
         self.infos: list[dict[str, Any]] = []
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
@@ -80,9 +78,9 @@ class SadgsModel(SplatfactoModel):
             self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
     def set_cameras(self, cameras: Cameras) -> None:
-        """Set extent, initial Gaussians and near plane for the training cameras; call before optimizers are made."""
+        """Set the extent and drop Gaussians that are too close to a camera; call before optimizers are made."""
         positions = camera_positions(cameras)
-        self.strategy_state["scene_scale"] = extent = camera_extent(positions)
+        self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
         keep = camera_distances(self.means.detach(), self.camera_positions, radii) >= radii
@@ -90,11 +88,6 @@ class SadgsModel(SplatfactoModel):
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
             self.synthetic = self.synthetic[keep.cpu()]
-        if self.config.near_plane is None:
-            points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
-            viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-            sizes = torch.cat([cameras.width, cameras.height], dim=-1)
-            self.near_plane = scene_near_plane(points, viewmats, cameras.get_intrinsics_matrices(), sizes, extent)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as many as the cap allows; call before optimizers are made. Return their number.
@@ -114,13 +107,16 @@ class SadgsModel(SplatfactoModel):
         self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
         return room
 
-    def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it."""
+    def clear_paths(self, viewmats: Tensor, near_plane: float) -> None:
+        """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it.
+
+        `near_plane` is the depth from which Gaussians will be drawn.
+        """
         if self.config.clear_paths:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             if self.seed_points is not None:  # From those near cameras no Gaussian starts.
                 surfaces = torch.cat([surfaces, self.seed_points[0].to(surfaces)])
-            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
+            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, near_plane, surfaces)
 
     def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
@@ -138,7 +134,7 @@ class SadgsModel(SplatfactoModel):
 
     def follow(self, plan: RunPlan) -> None:
         """From now on, densify, average and draw according to a plan."""
-        self.plan, self.near_plane = plan, plan.near_plane
+        self.plan = plan
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
     def step_post_backward(self, step: int) -> None:
@@ -204,8 +200,9 @@ class SadgsModel(SplatfactoModel):
     @property
     def drawing(self) -> RenderOptions:
         """The options that all pictures of these Gaussians share; `color_options` are for colours."""
-        config = self.config
-        return RenderOptions(near_plane=self.near_plane, max_off_axis=config.max_off_axis, backend=config.backend)
+        return RenderOptions(
+            near_plane=self.plan.near_plane, max_off_axis=self.plan.max_off_axis, backend=self.config.backend
+        )
 
     def color_options(self, **changes: Any) -> RenderOptions:
         """Return the options to draw colours at this step, with other values of some fields."""

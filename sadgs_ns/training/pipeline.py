@@ -57,8 +57,11 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         loads_images = config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference"
-        if loads_images and (line := choose_image_storage(self.datamanager, self.device)):
-            note(line)
+        if loads_images:
+            storage = choose_image_storage(self.datamanager, self.device)
+            self.datamanager.config.cache_images = storage.where  # type: ignore[assignment]
+            if storage.sentence:
+                note(storage.sentence)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
             told = f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}"
@@ -104,23 +107,22 @@ class SadgsPipeline(VanillaPipeline):
         # The log is read before densification makes new parameters, which have no gradients.
         return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
 
-    def check_visibility(self) -> None:
+    def check_visibility(self, near_plane: float) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
         means = self.model.means.detach()
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
-        near = self.model.near_plane
-        drawn = ((depths > near) & (depths < FAR_PLANE)).any(dim=1)
+        drawn = ((depths > near_plane) & (depths < FAR_PLANE)).any(dim=1)
         world = self.model.world
         share = world.sum(drawn.float().mean().to(world.device)) / world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {near:.2g} to {FAR_PLANE:g} units and the "
-                f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
-                "leave its auto-scale-poses on."
+                f"The renderings would be empty, since a camera sees from {near_plane:.2g} to {FAR_PLANE:g} units and "
+                f"the cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, "
+                "or leave its auto-scale-poses on."
             )
 
     def _report_nonfinite(self, last: bool = False) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -32,6 +33,7 @@ from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.growth import absgs
@@ -379,6 +381,7 @@ def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     model: SadgsModel = config.setup(
         scene_box=SceneBox(torch.ones(2, 3)), num_train_data=1, seed_points=(points, colors)
     )
+    model.plan = SimpleNamespace(near_plane=NEAR_PLANE, max_off_axis=config.max_off_axis)  # type: ignore[assignment]
     params = model.gauss_params
     assert len(params["means"]) >= len(points)
     assert all(bool(p.isfinite().all()) for p in params.values())

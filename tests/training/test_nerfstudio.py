@@ -671,7 +671,7 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
     _, pipeline, _, _ = eval_setup(finished / "config.yml")
     model: Any = pipeline.model
     assert isinstance(model, SadgsModel) and model.config.near_plane is None
-    assert model.near_plane == stored
+    assert model.plan.near_plane == stored
     datamanager: Any = pipeline.datamanager
     cameras = datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
@@ -694,9 +694,9 @@ def test_a_plane_that_is_given_is_kept_also_where_the_checkpoint_has_another(
 ):
     config = configure(tmp_path, colmap, ITERATIONS)
     config.pipeline.model.near_plane = 0.123
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.load_dir = finished / "nerfstudio_models"
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.pipeline.model.near_plane = 0.0
     with pytest.raises(InputError, match=r"^pipeline\.model\.near_plane must be positive and finite, got 0\.$"):
         set_up(config)

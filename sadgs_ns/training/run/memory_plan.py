@@ -63,31 +63,46 @@ def image_bytes(datamanager: FullImageDatamanager) -> float:
     return 3 * (train + held_out) + QUANTIZED_BYTES * train
 
 
-def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
-    """Choose where the images are kept, by the free memory, alike in all processes; call before they are loaded.
+@dataclass(frozen=True)
+class ImageStorage:
+    """Where a run keeps its images."""
 
-    Returns a line for the user; None if images are kept on the device, or where the user said.
+    where: str  # A value of the datamanager's option `cache_images`
+    sentence: str = ""  # What to tell the user; empty if the images are kept where the options ask for
+
+
+def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> ImageStorage:
+    """Choose where the images are kept, by the free memory, alike in all processes. Images need not be loaded.
+
+    "gpu" and "cpu" are the datamanager's options that can change; the caller applies what is returned.
     """
-    config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
-    host = least(host_memory.available_host_bytes() / sharing, device)
+    requested: str = datamanager.config.cache_images
+    size = image_bytes(datamanager)
+    host_free = least(host_memory.available_host_bytes() / processes_on_this_machine(), device)
+    fits_host = size <= HOST_SHARE * host_free
     needs = f"decoded images and their structure take {size / 1e9:.2g} GB"
+    on_host = "The images stay in the host's memory and are copied ahead of the steps"
     compressed = "The images stay compressed and are decoded ahead of the steps"
-    if config.cache_images == "cpu":
+    if requested == "cpu":
         # Several processes would each decode all images.
-        if number_of_processes() == 1 or size <= HOST_SHARE * host:
-            return None
-        config.cache_images = "compressed"  # type: ignore[assignment]
-        return f"{compressed}: {needs} in each process, and the host has {host / 1e9:.2g} GB free for each."
-    free, share, name = host, HOST_SHARE, "the host"
-    if device.type == "cuda":
-        share = IMAGE_SHARE if len(datamanager.train_dataset) > MANY_IMAGES else FEW_IMAGES_SHARE
-        free, name = least(memory.available_bytes(device)[0], device), "the GPU"
-    if size <= share * free:
-        return None
-    fits_host = device.type == "cuda" and size <= HOST_SHARE * host
-    config.cache_images = "cpu" if fits_host else "compressed"  # type: ignore[assignment]
-    where = "The images stay in the host's memory and are copied ahead of the steps" if fits_host else compressed
-    return f"{where}: {needs}, and {name} has {free / 1e9:.2g} GB free."
+        if fits_host or number_of_processes() == 1:
+            return ImageStorage(requested)
+        free = f"the host has {host_free / 1e9:.2g} GB free for each"
+        return ImageStorage("compressed", f"{compressed}: {needs} in each process, and {free}.")
+    if device.type != "cuda":
+        if fits_host:
+            return ImageStorage(requested)
+        return ImageStorage("compressed", f"{compressed}: {needs}, and the host has {host_free / 1e9:.2g} GB free.")
+    share = FEW_IMAGES_SHARE
+    if len(datamanager.train_dataset) > MANY_IMAGES:
+        share = IMAGE_SHARE
+    device_free = least(memory.available_bytes(device)[0], device)
+    if size <= share * device_free:
+        return ImageStorage(requested)
+    reason = f"{needs}, and the GPU has {device_free / 1e9:.2g} GB free"
+    if fits_host:
+        return ImageStorage("cpu", f"{on_host}: {reason}.")
+    return ImageStorage("compressed", f"{compressed}: {reason}.")
 
 
 def fit_to_memory(

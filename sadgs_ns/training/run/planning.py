@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.memory_plan import fit_to_memory, training_size
@@ -22,6 +24,26 @@ LEAST_PIXELS = 1.5e6
 """Pixels of a step on each of several devices, below which one is quicker. With 1.9 and 3 million, two devices took
 1/1.1 of the time of one (1/1.3 in one run), and with .7 million 2.3 times as long (docs/results.md#several-devices)."""
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
+
+
+def decide_near_plane(pipeline: SadgsPipeline, before: RunPlan | None) -> float:
+    """Return the depth from which Gaussians are drawn: the option's, the one of the plan `before`, or the scene's.
+
+    Call this before images are undistorted, which changes the cameras' intrinsics and sizes.
+    """
+    model = pipeline.model
+    if model.config.near_plane is not None:
+        return model.config.near_plane
+    if before is not None:
+        return before.near_plane
+    points = model.means.new_zeros((0, 3))
+    if model.seed_points is not None:
+        points = model.seed_points[0].to(model.means)
+    cameras = pipeline.datamanager.train_dataset.cameras
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    sizes = torch.cat([cameras.width, cameras.height], dim=-1)
+    extent = float(model.strategy_state["scene_scale"])
+    return scene_near_plane(points, viewmats, cameras.get_intrinsics_matrices(), sizes, extent)
 
 
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
@@ -55,6 +77,7 @@ def plan_run(
     pipeline: SadgsPipeline,
     length: Schedule,
     *,
+    near_plane: float,
     dense: bool,
     before: RunPlan | None,
     done: int,
@@ -96,7 +119,7 @@ def plan_run(
         **vars(length),
         devices=model.world.num_ranks,
         images=pipeline.datamanager.config.cache_images,
-        near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
+        near_plane=near_plane,
         max_off_axis=options.model.max_off_axis,
         strategy=planned,
         rates=plan_rates(optimizers, length, extent, config.rates_follow_views),

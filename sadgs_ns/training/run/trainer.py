@@ -29,7 +29,7 @@ from sadgs_ns.training.kernels_ahead import compile_ahead
 from sadgs_ns.training.kernels_ahead.compilation import compile_kernels
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints, processes
-from sadgs_ns.training.run.planning import one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.run.planning import decide_near_plane, one_device_is_quicker, plan_length, plan_run
 from sadgs_ns.training.run.progress import next_commands, note, remove_tables
 from sadgs_ns.training.run.resume import Resumption
 from sadgs_ns.training.run.run_folder import write_config
@@ -129,10 +129,11 @@ class SadgsTrainer(Trainer):
         chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
         self._resumed = resumed = None if chosen is None else Resumption(*chosen)
         before = None if resumed is None else resumed.plan
+        near_plane = decide_near_plane(pipeline, before)
         dense = start_from_stereo(pipeline, resumed=resumed is not None)
         cameras = pipeline.datamanager.train_dataset.cameras
         if resumed is None:
-            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
+            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds), near_plane)
         length = plan_length(config, len(cameras), before)
         peers, views = None if config.share_always else self._peers, length.views_per_iteration
         if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
@@ -147,8 +148,10 @@ class SadgsTrainer(Trainer):
         if resumed is not None:
             resumed.load_gaussians(pipeline, self.world)
             self._start_step = resumed.state["step"] + 1
-        pipeline.check_visibility()
-        plan = plan_run(config, pipeline, length, dense=dense, before=before, done=self._start_step)
+        pipeline.check_visibility(near_plane)
+        plan = plan_run(
+            config, pipeline, length, near_plane=near_plane, dense=dense, before=before, done=self._start_step
+        )
         pipeline.follow(plan)
         config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
         return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())

@@ -196,10 +196,10 @@ def test_cameras_that_see_nothing_are_refused(config: SadgsTrainerConfig):
 
 
 def test_a_scene_in_tiny_units_is_seen_since_its_near_plane_is_in_them(config: SadgsTrainerConfig):
-    plane = set_up(config).pipeline.model.near_plane
+    plane = set_up(config).pipeline.model.plan.near_plane
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e-4)
-    assert set_up(config).pipeline.model.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
+    assert set_up(config).pipeline.model.plan.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
 
 
 @pytest.mark.hard_case(

@@ -33,6 +33,7 @@ from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
 from sadgs_ns.training.run.memory_plan import (
+    ImageStorage,
     TrainingSize,
     choose_image_storage,
     fit_to_memory,
@@ -279,26 +280,24 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1e15)
 
     card(1.01 * size / share / 1e9, 80)
-    assert choose_image_storage(small, gpu) is None
-    assert small.config.cache_images == "gpu"
+    assert choose_image_storage(small, gpu) == ImageStorage("gpu")
     card(0.99 * size / share / 1e9, 80)
-    assert (choose_image_storage(small, gpu) or "").startswith(
+    storage = choose_image_storage(small, gpu)
+    assert storage.where == "cpu" and small.config.cache_images == "gpu", "the caller applies it"
+    assert storage.sentence.startswith(
         "The images stay in the host's memory and are copied ahead of the steps: decoded images and their structure "
         f"take {size / 1e9:.2g} GB, and the GPU has 0."
     )
-    assert small.config.cache_images == "cpu"
 
     card(80, 80)
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
-        line = choose_image_storage(large, device) or ""
-        assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded images and ")
-        assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
-        assert large.config.cache_images == "compressed"
+        storage = choose_image_storage(large, device)
+        compressed = "The images stay compressed and are decoded ahead of the steps: decoded images and "
+        assert storage.where == "compressed" and storage.sentence.startswith(compressed)
+        assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in storage.sentence
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
-    large.config.cache_images = "gpu"
-    assert choose_image_storage(large, torch.device("cpu")) is None
-    assert large.config.cache_images == "gpu"  # the training device
+    assert choose_image_storage(large, torch.device("cpu")) == ImageStorage("gpu")  # the training device
 
 
 @pytest.mark.parametrize(
