@@ -15,11 +15,11 @@ from torch import Tensor
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
-from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+from sadgs_ns.render.step_memory import StepSize, affordable_growth, free_bytes
 
 Info = Mapping[str, Any]
 Infos = Info | Sequence[Info]  # gsplat's info of the views of a step, or a list with one for each image size
