@@ -121,7 +121,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
 def test_where_none_violates_nothing_is_split(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = params["means"].detach().clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], before)
 
 
@@ -233,7 +233,7 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
     before = bytes_kept()
-    short().densify(params, optimizers, state, 9, [])
+    short().for_run(3000).densify(params, optimizers, state, 9, [])
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
@@ -308,7 +308,7 @@ def test_pruning_may_leave_one():
     params, state = random_params(5), observed(5, 0.01)
     params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
     kept = params["means"].detach()[2:3].clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], kept)
 
 

@@ -246,11 +246,11 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     assert model.num_points < 120
     assert "At most 120 Gaussians: 0.0 GB of the card's 8.0 GB; " in capsys.readouterr().out
     trainer.train()
-    assert model.num_points == model.strategy.max_gaussians == 120
+    assert model.num_points == model.plan.strategy.max_gaussians == 120
     assert config.pipeline.model.strategy.max_gaussians == DEFAULT, "config.yml tells what was asked for"
     card(139, 140)
     trainer = set_up(unbounded)
-    assert trainer.pipeline.model.strategy.max_gaussians == DEFAULT
+    assert trainer.pipeline.model.plan.strategy.max_gaussians == DEFAULT
 
 
 def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_path: Path):
