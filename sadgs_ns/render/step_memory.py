@@ -19,6 +19,8 @@ from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
 
+Params = Mapping[str, Tensor] | torch.nn.ParameterDict
+"""The Gaussians' parameters by name, each with leading dimension N."""
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
 takes the place of the statistics and of a split's copy, which are gone by then."""
@@ -87,13 +89,13 @@ def free_bytes(device: torch.device) -> float:
     return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
 
 
-def kept_bytes(params: Mapping[str, Tensor], state: Mapping[str, Any]) -> int:
+def kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
     """Bytes that one Gaussian keeps: its parameters, their gradients and moments, and its statistics in `state`."""
     tensors = [value for value in state.values() if isinstance(value, Tensor)]
     return COPIES * sum(map(_row_bytes, params.values())) + sum(map(_row_bytes, tensors))
 
 
-def widest_bytes(params: Mapping[str, Tensor]) -> int:
+def widest_bytes(params: Params) -> int:
     """Bytes of a Gaussian's widest parameter; while a split copies it to its new length, memory holds it twice."""
     return max(map(_row_bytes, params.values()))
 
@@ -103,7 +105,7 @@ def step_bytes(num_gaussians: int, size: StepSize, device: torch.device) -> dict
     return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, device).items()}
 
 
-def affordable_growth(params: Mapping[str, Tensor], state: Mapping[str, Any], free: float, size: StepSize) -> float:
+def affordable_growth(params: Params, state: Mapping[str, Any], free: float, size: StepSize) -> float:
     """How many Gaussians may be added so that adding them and the next training step fit; ≥ 0, or infinity.
 
     Added Gaussians bring `PAIRS_PER_GAUSSIAN` pairs each in every view.
