@@ -129,7 +129,7 @@ class Step:
             self.params[name].grad = gradient  # torch's Adam has used it up, and this may be called again.
 
     def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
-        """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `memory.step_bytes`."""
+        """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `step_memory.step_bytes`."""
         self.forget_gradients()
         drawn = self.draw()
         if self.count % ETA_EVERY == 0:

@@ -34,15 +34,15 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.method import memory
 from sadgs_ns.method import strategy as strategy_module
 from sadgs_ns.method.growth import absgs
-from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.split import children_per_axis
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.render import step_memory
+from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.model import SadgsModel
@@ -124,7 +124,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
 def test_where_none_violates_nothing_is_split(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = params["means"].detach().clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], before)
 
 
@@ -217,7 +217,7 @@ def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(ch
 @pytest.mark.hard_case("a run without CUDA", "no limit of memory is assumed")
 def test_without_cuda_memory_is_not_planned():
     params = random_params(5)
-    assert memory.affordable_growth(params, {}, memory.free_bytes(CPU), StepSize()) == math.inf
+    assert step_memory.affordable_growth(params, {}, step_memory.free_bytes(CPU), StepSize()) == math.inf
 
 
 @pytest.mark.hard_case("what a new Gaussian keeps in memory", "is counted")
@@ -236,19 +236,19 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
     before = bytes_kept()
-    short().densify(params, optimizers, state, 9, [])
+    short().for_run(3000).densify(params, optimizers, state, 9, [])
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
-    at_first, later = (max(memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
-    pairs = memory.PAIRS_PER_GAUSSIAN * grown * memory.PAIR_SORT_BYTES
+    at_first, later = (max(step_memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
+    pairs = step_memory.PAIRS_PER_GAUSSIAN * grown * step_memory.PAIR_SORT_BYTES
     widest = 16  # quaternions
-    lists = memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
+    lists = step_memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
     needed = bytes_kept() - before + (50 + grown) * widest + max(lists, later)
     original = random_params(50)
-    assert memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
-    assert memory.affordable_growth(original, observed(50, 4.0), needed - 1, size) == grown - 1
-    assert memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
+    assert step_memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
+    assert step_memory.affordable_growth(original, observed(50, 4.0), needed - 1, size) == grown - 1
+    assert step_memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
 
 
 @pytest.mark.hard_case(
@@ -311,7 +311,7 @@ def test_pruning_may_leave_one():
     params, state = random_params(5), observed(5, 0.01)
     params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
     kept = params["means"].detach()[2:3].clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], kept)
 
 

@@ -772,14 +772,14 @@ def test_a_resumption_keeps_the_cap_where_memory_has_room_for_it(
     plan(500)
     trainer = set_up(config)
     trainer.save_checkpoint(1)
-    assert trainer.pipeline.model.strategy.max_gaussians == 500
+    assert trainer.pipeline.model.plan.strategy.max_gaussians == 500
     plan(now)
     config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
     config.pipeline.model.strategy.max_gaussians = asked
     capsys.readouterr()
     resumed = set_up(config)
     printed = capsys.readouterr().out
-    assert resumed.pipeline.model.strategy.max_gaussians == cap
+    assert resumed.pipeline.model.plan.strategy.max_gaussians == cap
     assert resumed.pipeline.structure.set_max_gaussians.value == cap
     assert said in printed and (said or "checkpoint's run" not in printed)
 

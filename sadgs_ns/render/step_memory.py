@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.ops import Params
 
+Params = Mapping[str, Tensor] | torch.nn.ParameterDict
+"""The Gaussians' parameters by name, each with leading dimension N."""
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
 takes the place of the statistics and of a split's copy, which are gone by then."""
