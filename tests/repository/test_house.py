@@ -13,12 +13,11 @@ ROOT = Path(sadgs_ns.__file__).parent
 USES = {
     # folder: the other folders that its modules may import; all may import the modules that lie flat in the package
     "cli": {"placing", "training", "viewer", "formats", "data", "geometry", "method", "render", "kernels"},
-    # The pipeline makes the panels that show its model; the test below keeps modules from importing in a circle.
     "training": {"viewer", "data", "geometry", "method", "distributed", "render", "kernels"},
     "viewer": {"training", "geometry", "method", "render"},
-    "placing": {"data", "cli"},
+    "placing": {"data"},
     "formats": {"data"},
-    "data": {"geometry"},  # which points count as outliers
+    "data": {"geometry"},  # Which points count as outliers
     "geometry": {"render"},
     "method": {"distributed", "render", "kernels"},
     "distributed": {"render", "kernels"},
