@@ -116,7 +116,9 @@ def affordable_growth(params: Params, state: Mapping[str, Any], free: float, siz
     """
     if math.isinf(free):
         return free
-    n, widest, new_pairs = len(params["means"]), widest_bytes(params), PAIRS_PER_GAUSSIAN * size.views
+    n = len(params["means"])
+    widest = widest_bytes(params)
+    new_pairs = PAIRS_PER_GAUSSIAN * size.views
     kept = kept_bytes(params, state)
     growth = min(
         (free - n * (a + widest) - b - p * size.pairs) / (kept + widest + a + p * new_pairs)
