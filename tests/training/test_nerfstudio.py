@@ -503,7 +503,7 @@ def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataPa
     code = f"""
 import os, signal, torch
 from pathlib import Path
-from sadgs_ns.training import checkpoints
+from sadgs_ns.training.run import checkpoints
 def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)

@@ -74,7 +74,8 @@ def one_line(text: str, start: str) -> str:
 
 def kill_and_resume(*arguments: object) -> str:
     """Run the script and return its output."""
-    script = f"import sys, kill_and_resume; sys.exit(kill_and_resume.main({[str(word) for word in arguments]}))"
+    words = [str(word) for word in arguments]
+    script = f"import sys; from helpers import kill_and_resume; sys.exit(kill_and_resume.main({words}))"
     result = forked_python.python(script, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
