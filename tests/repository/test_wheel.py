@@ -15,7 +15,8 @@ from importlib.metadata import Distribution
 from pathlib import Path
 
 import pytest
-from processes import HANGS
+
+from helpers.forked_python import HANGS
 
 CHECKOUT = Path(__file__).parents[2]
 PACKAGE = CHECKOUT / "sadgs_ns"

@@ -172,7 +172,8 @@ def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
     overridden = set(vars(SadgsModel)) - set(re.findall(r"super\(\)\.(\w+)", ours))
     methods = [m for name, m in vars(SplatfactoModel).items() if inspect.isfunction(m) and name not in overridden]
     used = [m for m in methods if m.__name__ not in ("_get_downscale_factor", "_downscale_if_required")]
-    read = set(re.findall(r"(?:config|options\.model)\.(\w+)", ours + "".join(inspect.getsource(method) for method in used)))
+    sources = ours + "".join(inspect.getsource(method) for method in used)
+    read = set(re.findall(r"(?:config|options\.model)\.(\w+)", sources))
     options = {option.name for option in dataclasses.fields(SadgsModelConfig) if not option.name.startswith("_")}
     assert {name for name in read if name in vars(SplatfactoModelConfig())} <= options
     assert options <= read, "an option that nothing reads"
@@ -317,7 +318,7 @@ def test_everything_imported_is_required_by_us_or_by_nerfstudio():
     # Python 3.10 has no tomllib, for which tomli stands there.
     extras = project["optional-dependencies"]
     for_tests = ours | requirements(extras["dev"] + extras["docs"])
-    local = {*folders, "helpers", "tomllib", *(path.stem for path in (CHECKOUT / "tests").glob("*.py"))}
+    local = {*folders, "helpers", "tomllib", *(path.stem for path in (CHECKOUT / "tests").rglob("*.py"))}
     distributions = packages_distributions()
     undeclared = []
     for path in [path for folder in folders for path in CHECKOUT.glob(f"{folder}/**/*.py")]:
