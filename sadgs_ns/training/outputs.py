@@ -29,7 +29,7 @@ class LazyOutputs(UserDict[str, Any]):
 
 def in_viewer() -> bool:
     """Tell whether nerfstudio's viewer draws in this thread."""
-    from nerfstudio.viewer.render_state_machine import RenderStateMachine  # It imports the viewer, which takes a while.
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine  # It imports viser.
 
     return isinstance(threading.current_thread(), RenderStateMachine)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,12 @@ from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step import nonfinite
 from sadgs_ns.training.step.images import stack
 from sadgs_ns.training.step.nonfinite import NonFiniteLog
-from sadgs_ns.training.step.structure_cache import StructureCache
+from sadgs_ns.training.step.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.training.step.train_step import StepResult, ViewGroup
 from sadgs_ns.training.step.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import shows_output
+from sadgs_ns.viewer.shown_run import ShownRun
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
 _NAMED_STEPS = 5  # Number of iterations whose images a report of losses that are not finite names
@@ -76,9 +78,26 @@ class SadgsPipeline(VanillaPipeline):
         self.log = NonFiniteLog(self.device)
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
         self.diverged = ""  # a sentence with the reason once nothing is learned any more
-        self.structure = StructurePanel(self.structure_cache)
-        self.cleaning = CleaningPanel(self.views)
+        shown_run = ShownRun(
+            model=self.model,
+            datamanager=self.datamanager,
+            structure_tensors=self.structure_cache,
+            view_cameras=self._view_cameras,
+            observe=partial(observe_training_views, self.structure_cache),
+            warn=warn,
+        )
+        self.structure = StructurePanel(shown_run)
+        self.cleaning = CleaningPanel(shown_run)
         self.model.viewer_outputs = self._viewer_outputs
+
+    def _view_cameras(self) -> list[Pinholes]:
+        """Return the camera of each training view, with the pose that is learned so far."""
+        _, Ks = self.views.cameras
+        cameras = []
+        for index, (height, width) in enumerate(self.views.sizes):
+            viewmat = self.views.viewmat(index).detach()
+            cameras.append(Pinholes(viewmat[None], Ks[index][None], width, height))
+        return cameras
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the panels' pictures and normals, which cannot be lazy while training changes the Gaussians."""
