@@ -30,7 +30,8 @@ from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.capture import check_capture
-from sadgs_ns.data.parsers import AutomaticDataParserConfig, ColmapParser, choose_parser
+from sadgs_ns.data.own_parsers import ColmapParser
+from sadgs_ns.data.parsers import AutomaticDataParserConfig, choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 
