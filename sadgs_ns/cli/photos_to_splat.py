@@ -11,7 +11,6 @@ from typing import Any
 
 from rich.console import Console
 
-from sadgs_ns.cli.added_photos import choose_run
 from sadgs_ns.cli.given_cameras import find_given_cameras
 from sadgs_ns.cli.process import Process
 from sadgs_ns.cli.sadgs_folder import SadgsFolder, Settings
@@ -86,14 +85,6 @@ class PhotosToSplat:
             train_options=list(self.train_options),
         )
         self.results.read_settings(chosen, self.given)
-
-    # Names of before, which the tests still use.
-    _scene = property(lambda self: self.results.scene)
-    _run = property(lambda self: self.results.run)
-    _checkpoint = property(lambda self: self.results.checkpoint)
-
-    def _choose_run(self) -> None:
-        choose_run(self.results, self.train_options)
 
     @contextlib.contextmanager
     def begin(self, lock_seconds: float) -> Iterator[None]:
