@@ -11,25 +11,17 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 
-from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.checks.findings import check_findings
-from sadgs_ns.data.layouts import find_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, MESH
 from sadgs_ns.formats.mesh import load_open3d
+from sadgs_ns.method.schedule import MOST_EFFORT
+from sadgs_ns.placing.options import check_size
 
-SET_OPTIONS = (
-    "data",
-    "output-dir",
-    "experiment-name",
-    "timestamp",
-    "vis",
-    "load-dir",
-    "load-checkpoint",
-    "load-config",
-)
+FORMAT_NAMES = [suffix.removeprefix(".") for suffix in (*FORMATS, MESH)]
+_SET_OPTIONS = (
+    "data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config",
+)  # fmt: skip
 """Options of ns-train that this command sets."""
-FORMAT_NAMES = [suffix[1:] for suffix in (*FORMATS, MESH)]
 
 
 @dataclass
@@ -58,40 +50,45 @@ class Sadgs:
     """Also print where the time went as a table."""
 
 
-def with_dashes(sentence: str, train_options: Sequence[str]) -> str:
-    """Return a sentence on the end of a command of `ns-train` as it is for this one."""
-    return sentence.replace("end the command with `", "end the command with `" + "-- " * (not train_options))
+def choose_formats(requested: str | None, console: Console) -> list[str]:
+    """Return the formats to export, with the page as the last one.
 
-
-def find_given_cameras(options: Sadgs, train_options: Sequence[str]) -> Path | None:
-    """Return the file of the source's cameras, or None; raise InputError if they cannot be trained on."""
-    try:
-        if options.cameras == "new" or (file := find_cameras(options.source)) is None:
-            return None
-        # Training checks what a parser reads that is named.
-        if {"colmap", "nerfstudio-data", "blender-data"}.isdisjoint(train_options):
-            check_findings(check_data(options.source), options.source)
-    except InputError as error:
-        told = with_dashes(str(error).rstrip("."), train_options)
-        raise InputError(f"{told}; or find new cameras with --cameras new.") from None
-    if options.max_size != Sadgs.max_size:
-        smaller = "or for images of half the size `-- --pipeline.datamanager.camera-res-scale-factor 0.5` at the end"
-        raise InputError(f"--max-size is for new cameras, and those of {file} are used: leave it out, {smaller}.")
-    return file
-
-
-def choose_formats(asked: str | None, console: Console) -> list[str]:
-    """Return the formats to export; raise InputError for an unknown one, or for a page without Node.js."""
+    Without a request they are a page and a PLY, or the PLY alone if there is no Node.js, which the console then says.
+    Raise InputError for an unknown format, a page without Node.js, or a mesh without open3d.
+    """
     has_node = shutil.which("npx") is not None
-    if asked is None:
-        if not has_node:
-            console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
-        return ["html", "ply"] if has_node else ["ply"]
-    chosen = list(dict.fromkeys(asked.split(",")))
-    if unknown := [name for name in chosen if name not in FORMAT_NAMES]:
+    if requested is None:
+        if has_node:
+            return ["ply", "html"]
+        console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
+        return ["ply"]
+    formats = list(dict.fromkeys(requested.split(",")))
+    unknown = [name for name in formats if name not in FORMAT_NAMES]
+    if unknown:
         raise InputError(f"--formats knows {', '.join(FORMAT_NAMES)}, and not {unknown[0]!r}.")
-    if "html" in chosen and not has_node:
+    if "html" in formats and not has_node:
         raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
-    if MESH[1:] in chosen:
+    if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
-    return chosen
+    return sorted(formats, key=lambda name: name == "html")
+
+
+def check_options(options: Sadgs, train_options: Sequence[str]) -> None:
+    """Raise InputError if a number is out of range, or an option for ns-train is one that `sadgs` sets itself."""
+    if not 0 < options.effort <= MOST_EFFORT:
+        raise InputError(f"--effort must be in (0, {MOST_EFFORT}].")
+    check_size(options.max_size)
+    for option in train_options:
+        name = option.partition("=")[0].lstrip("-").replace("_", "-")
+        if option.startswith("--") and name in _SET_OPTIONS:
+            raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
+
+
+def adapt_remedy(sentence: str, train_options: Sequence[str]) -> str:
+    """Adapt a sentence that says how to end a command of ns-train: here its options must follow --.
+
+    Commands that have options for ns-train already end with these.
+    """
+    if train_options:
+        return sentence
+    return sentence.replace("end the command with `", "end the command with `-- ")

@@ -23,7 +23,9 @@ from helpers.captures import LAYOUTS, Capture, write_capture
 from helpers.drawn_photos import draw_photos
 from helpers.forked_python import HANGS
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.sadgs import PhotosToSplat, main
+from sadgs_ns.cli.added_photos import choose_run
+from sadgs_ns.cli.photos_to_splat import PhotosToSplat
+from sadgs_ns.cli.sadgs import main
 from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
@@ -236,24 +238,24 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
 
 def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_split(photos: Path, tmp_path: Path):
     work = PhotosToSplat(Sadgs(photos, tmp_path / "out"), [], Console(quiet=True))
-    work._scene.mkdir(parents=True)
+    work.results.scene.mkdir(parents=True)
 
     def choose(number: int) -> dict[str, Any]:
-        file = work._scene / "transforms.json"
+        file = work.results.scene / "transforms.json"
         described = json.loads(file.read_text()) if file.exists() else {}
         frames = [{"file_path": f"images/{i:02d}.png"} for i in range(number)]
         file.write_text(json.dumps(described | {"frames": frames}))
-        work._choose_run()
+        choose_run(work.results, [])
         return json.loads(file.read_text())
 
     assert choose(20).keys() == choose(30).keys() == {"frames"}, "no run has begun"
-    checkpoints = work._run / "nerfstudio_models"
+    checkpoints = work.results.run / "nerfstudio_models"
     checkpoints.mkdir(parents=True)
     (checkpoints / "step-000000007.ckpt").touch()
     moved = {"transform": [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
-    (work._run / "dataparser_transforms.json").write_text(json.dumps(moved))
+    (work.results.run / "dataparser_transforms.json").write_text(json.dumps(moved))
     first = choose(40)
-    assert work._run.name == "run-40" and work._checkpoint() is None
+    assert work.results.run.name == "run-40" and work.results.checkpoint() is None
     assert (first["dataparser_transform"], first["dataparser_scale"]) == (moved["transform"], moved["scale"])
     second = choose(50)
     assert len({*second["train_filenames"], *second["test_filenames"]}) == 50
@@ -390,8 +392,8 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         on_event("warning", told="masks are not used: end the command with `colmap` to use them.")
         on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
-        (work._run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
-        (work._run / "nerfstudio_models" / "step-000000007.ckpt").touch()
+        (work.results.run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
+        (work.results.run / "nerfstudio_models" / "step-000000007.ckpt").touch()
 
     monkeypatch.setattr(PhotosToSplat, "call", call)
     monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
