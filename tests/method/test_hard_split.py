@@ -501,7 +501,7 @@ def test_the_guard_never_waits_within_a_step():
     with HostWaits() as waits:
         for step in range(10):
             assert not log.full
-            nonfinite.leave_out_nonfinite(gradient, log.slot)
+            nonfinite.leave_out_nonfinite(gradient, log.nonfinite_flag)
             log.record(step, [step], loss)
     assert waits.number == 0 and log.full and not gradient.any()
     with HostWaits() as waits:
@@ -522,7 +522,7 @@ def test_the_log_names_steps_and_forgets_them_once_read():
     log = nonfinite.NonFiniteLog(CPU, capacity=4)
     log.record(7, [3], torch.tensor(0.5))
     log.record(8, [1, 2], torch.tensor(math.inf))
-    log.slot.fill_(math.nan)
+    log.nonfinite_flag.fill_(math.nan)
     log.record(9, [0], torch.tensor(0.5))
     assert log.read() == [(8, [1, 2], "the loss was inf"), (9, [0], "gradients were not finite")]
     log.record(10, [0], torch.tensor(0.5))

@@ -111,13 +111,14 @@ class Stages:
         factors = torch.zeros((2, sum(map(len, self.choice.updates))), device=self.device)
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
         flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.alone else ()
-        begin, noted = 0, torch.zeros(1, device=self.device)
+        begin = 0
+        nonfinite_flag = torch.zeros(1, device=self.device)
         for shapes in self.choice.updates:
             part, begin = slice(begin, begin + len(shapes)), begin + len(shapes)
             # Gradients and both moments may be the parameters themselves: they are all zero.
             values = tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes)
             adam_step(
-                values, values, values, values, factors[:, part], noted, flags,
+                values, values, values, values, factors[:, part], nonfinite_flag, flags,
                 betas=(0.9, 0.999), eps=1e-15, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 

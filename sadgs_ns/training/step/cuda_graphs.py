@@ -215,7 +215,8 @@ def _captured_step(model: SadgsModel, inputs: _Inputs, opacity_reg: float, updat
     """Launch a training step, and keep what the host reads of it."""
     # The flag begins at 16 bytes, because Triton would compile Adam anew for a lesser alignment.
     values = torch.zeros(5, device=update.device)
-    result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, values[4:])
+    nonfinite_flag = values[4:]
+    result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, nonfinite_flag)
     # `copy_` copies memory; a kernel that no step has launched before would be loaded during the capture.
     values[0].copy_(result.loss)
     values[1].copy_(result.psnr)

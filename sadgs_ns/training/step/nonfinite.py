@@ -18,7 +18,7 @@ class NonFiniteLog:
         self._losses: list[Tensor] = []  # scalars on the device
         # The first column is NaN if a gradient was left out. Rows of 16 bytes keep Triton from compiling Adam anew.
         self._gradients = torch.zeros((capacity, 4), device=device)
-        self._slots = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
+        self._flags = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
         self.capacity, self.steps, self.streak = capacity, 0, 0
 
@@ -28,9 +28,9 @@ class NonFiniteLog:
         return len(self._steps) >= self.capacity
 
     @property
-    def slot(self) -> Tensor:
-        """The `nonfinite_flag` of the present step, which is not recorded yet. float32 [1]"""
-        return self._slots[len(self._steps)]
+    def nonfinite_flag(self) -> Tensor:
+        """The flag of the present step, which is not recorded yet; NaN if a gradient was not finite. float32 [1]"""
+        return self._flags[len(self._steps)]
 
     def record(self, step: int, views: list[int], loss: Tensor) -> None:
         """Add a step with its views and its loss, a scalar that must not change in place."""
