@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
 from torch import Tensor
@@ -66,7 +67,6 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
-        self.infos: list[dict[str, Any]] = []
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
@@ -98,9 +98,11 @@ class SadgsModel(SplatfactoModel):
         if not room:
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]
-        means, scales = means[:room], scales[:room]
+        means = means[:room]
+        scales = scales[:room]
         spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [room]
-        scales, opacity = torch.minimum(scales, spacing.to(scales)), self.config.initial_opacity
+        scales = torch.minimum(scales, spacing.to(scales))
+        opacity = self.config.initial_opacity
         added = spheres(means, colors[:room], scales, opacity, sh_degree=self.config.sh_degree)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
@@ -137,11 +139,21 @@ class SadgsModel(SplatfactoModel):
         self.plan = plan
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
-    def step_post_backward(self, step: int) -> None:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Return the callback that nerfstudio calls before a step.
+
+        After a step, the pipeline calls `step_post_backward`, because it has the step's infos.
+        """
+        before_step, _ = super().get_training_callbacks(training_callback_attributes)
+        return [before_step]
+
+    def step_post_backward(self, step: int, infos: Sequence[dict[str, Any]] = ()) -> None:
         """Densify, prune haze and limit scales if that is due, and average the parameters at the run's end."""
-        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
-        self.infos = []
-        iterations, done = self.plan.iterations, self.step + 1
+        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, infos)
+        iterations = self.plan.iterations
+        done = self.step + 1
         before_mean = iterations - round(self.config.averaged_share * iterations) - done
         if before_mean >= 0:
             self.average.clear()  # A run that is trained on may have begun to average earlier.
@@ -151,7 +163,8 @@ class SadgsModel(SplatfactoModel):
             self.average.add(self.gauss_params)
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
-        share, positions = self.config.max_angular_scale, self.camera_positions
+        share = self.config.max_angular_scale
+        positions = self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)
 
@@ -240,7 +253,8 @@ class SadgsModel(SplatfactoModel):
 
     def step_options(self, cameras: Pinholes, indices: Sequence[int]) -> RenderOptions:
         """Return how training views, by their indices, are drawn at this step, with the foreseen length of lists."""
-        forecast, capacity = self.tile_forecast, None
+        forecast = self.tile_forecast
+        capacity = None
         if forecast is not None:
             capacity = forecast.capacity(indices, cameras[2:], self.num_points)
         return self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
@@ -268,7 +282,8 @@ class SadgsModel(SplatfactoModel):
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
         """
         check_camera_types(camera)
-        pinhole, background = self.pinhole(camera), self.background
+        pinhole = self.pinhole(camera)
+        background = self.background
         rows = self.shown_rows(chosen)
         if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
@@ -338,6 +353,10 @@ class SadgsModel(SplatfactoModel):
             return alpha * image[..., :3] + (1 - alpha) * background
         return image
 
+    def photo(self, data: Mapping[str, Any]) -> Tensor:
+        """Return an image of the datamanager as the loss sees it: on the device and the background. [H, W, 3]"""
+        return self.composite_with_background(self.get_gt_img(data["image"]), self.background)
+
     def get_loss_dict(
         self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
@@ -357,7 +376,8 @@ class SadgsModel(SplatfactoModel):
             target = self.composite_with_background(self.get_gt_img(target), background)
         if "mask" in batch:
             mask = batch["mask"].to(self.device)
-            target, rgb = target * mask, rgb * mask
+            target = target * mask
+            rgb = rgb * mask
         return rgb, target
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:

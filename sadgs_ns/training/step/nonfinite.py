@@ -20,7 +20,9 @@ class NonFiniteLog:
         self._gradients = torch.zeros((capacity, 4), device=device)
         self._flags = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
-        self.capacity, self.steps, self.streak = capacity, 0, 0
+        self.capacity = capacity
+        self.steps = 0
+        self.streak = 0
 
     @property
     def full(self) -> bool:
@@ -42,7 +44,8 @@ class NonFiniteLog:
         if not self._steps:
             return []
         problems = []
-        losses, gradients = torch.stack(self._losses).tolist(), self._gradients[: len(self._steps), 0].tolist()
+        losses = torch.stack(self._losses).tolist()
+        gradients = self._gradients[: len(self._steps), 0].tolist()
         for (step, views), loss, gradient in zip(self._steps, losses, gradients, strict=True):
             if not math.isfinite(loss):
                 problem = f"the loss was {loss}"
