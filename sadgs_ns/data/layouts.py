@@ -61,9 +61,16 @@ def _model_folders(data: Path) -> list[Path]:
     return [Path()] if is_whole and images_folder(data, Path(), colmap.image_names(data)) is not None else []
 
 
+def transforms_path(data: Path) -> Path:
+    """Return the file of a capture whose path is that of a JSON file, or of a folder with a `transforms.json`."""
+    if data.suffix == ".json":
+        return data
+    return data / "transforms.json"
+
+
 def find_cameras(data: Path) -> Path | None:
     """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
-    files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
+    files = [transforms_path(data), data / "transforms_train.json"]
     if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
         model = next(iter(models))
         files = [data / model / f"images.{colmap.model_kind(data / model)}"]

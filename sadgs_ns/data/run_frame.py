@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,23 +18,32 @@ from sadgs_ns.errors import InputError
 _FAR = 10.0  # Distance of cameras from the origin, in their extents, from which `centre_poses` moves them
 
 
-def centre_poses(meta: Mapping[str, Any], method: str) -> NDArray[np.float64]:
-    """Move poses that are far from the origin, as on a map, there; others stay, which is a translation by zeros.
+class Centring(NamedTuple):
+    """The translation by which the poses of a capture were moved to the origin before nerfstudio parses them."""
 
-    nerfstudio would round them first; raise InputError if it shall not centre them and rounds them coarsely. Return the
-    translation in the frames of the poses and of the data. [2, 3]
+    of_poses: NDArray[np.float64]  # In the frame of the poses, to be subtracted from positions. [3]
+    of_data: NDArray[np.float64]  # The same in the frame of the data. [3]
+
+
+def centre_poses(meta: Mapping[str, Any], method: str) -> Centring:
+    """Move the poses of frames to the origin if they are far from it, as on a map; the others stay.
+
+    nerfstudio rounds poses to float32 before it centres them. Raise InputError if the parser's `center_method` is none
+    and the cameras are so far away that this rounds coarsely.
     """
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float64)  # [V, 4, 4]
     middle = np.median(poses[:, :3, 3], axis=0)
-    distance, extent = np.abs(middle).max(), np.ptp(poses[:, :3, 3], axis=0).max()
+    distance = np.abs(middle).max()
+    extent = np.ptp(poses[:, :3, 3], axis=0).max()
     if method == "none" and distance > 1000 * extent:
         raise InputError("--center-method none leaves the cameras where float32 rounds their places: leave it out.")
-    middle *= method != "none" and distance > _FAR * extent
+    if method == "none" or distance <= _FAR * extent:
+        middle = np.zeros(3)
     for frame, pose in zip(meta["frames"], poses, strict=True):
         pose[:3, 3] -= middle
         frame["transform_matrix"] = pose
     applied = np.array(meta.get("applied_transform", np.eye(3, 4)), np.float64)
-    return np.stack([middle, np.linalg.pinv(applied[:, :3]) @ middle])
+    return Centring(middle, np.linalg.pinv(applied[:, :3]) @ middle)
 
 
 def undo_centring(outputs: DataparserOutputs, middle: NDArray[np.float64]) -> DataparserOutputs:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,11 @@ def read_blender(path: Path) -> dict[str, Any]:
         if not (path.parent / f"{frame['file_path']}.png").exists():
             frame["file_path"] = frame["file_path"].removesuffix(".png")
     return meta
+
+
+def blender_images(frames: Sequence[dict[str, Any]], data: Path) -> list[Path]:
+    """Return the images of a Blender scene's frames as `read_blender` returns them."""
+    return [data / (frame["file_path"].replace("./", "") + ".png") for frame in frames]
 
 
 def matrix_of(value: Any, rows: int) -> NDArray[np.float64] | None:

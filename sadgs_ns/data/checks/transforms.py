@@ -15,12 +15,13 @@ from sadgs_ns.data.checks.images import check_images
 from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.coordinates import fixed_frame
-from sadgs_ns.data.layouts import COLMAP_FOLDERS, ParserOptions
+from sadgs_ns.data.layouts import COLMAP_FOLDERS, ParserOptions, transforms_path
 from sadgs_ns.data.transforms import (
     APPLIED_TRANSFORM,
     DISTORTION,
     PERSPECTIVE,
     PINHOLE,
+    blender_images,
     camera_of,
     focal_length,
     matrix_of,
@@ -35,7 +36,7 @@ from sadgs_ns.errors import InputError
 @collect_findings
 def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a `transforms.json`, or the one in a folder, and its images if asked."""
-    path = data if data.suffix == ".json" else data / "transforms.json"
+    path = transforms_path(data)
     if not path.is_file():
         raise InputError(no_layout(data))
     folder, meta = path.parent, read_transforms(path)
@@ -106,7 +107,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
         if "time" in described[0] and split == "train":
             told = f"{path} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
             yield warning(f"{told}: what moves will blur, so keep the frames of one time if you can.")
-        paths = [data / (frame["file_path"].replace("./", "") + ".png") for frame in described]
+        paths = blender_images(described, data)
         size = images.image_size(paths[0])  # The cameras have no size of their own.
         width, height = size if open_images and any(size) else (1, 1)  # The other checks need none.
         focal = focal_length(meta, width, "camera_angle_x", str(path))
