@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from helpers.small_scenes import adam, camera, random_params, training_step
-from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
