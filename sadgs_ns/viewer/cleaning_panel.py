@@ -9,7 +9,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, ViewerSlider, ViewerVec3
 from torch import Tensor
 
-from sadgs_ns.errors import reason
+from sadgs_ns.errors import InputError, reason
 from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 from sadgs_ns.viewer.shown_run import ShownRun
@@ -130,7 +130,11 @@ class CleaningPanel(torch.nn.Module):
         if self._shown == OFF or len(self._stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
         chosen = self._stays if self._shown == STAYS else ~self._stays
-        return {OUTPUT: model.get_outputs(camera, chosen)["rgb"]}
+        try:
+            drawn = model.get_outputs(camera, chosen)
+        except InputError:  # The camera is no pinhole: `rendered` is empty, and the model has warned of it.
+            return {OUTPUT: rendered["rgb"]}
+        return {OUTPUT: drawn["rgb"]}
 
 
 def command_line_options(cleaning: Cleaning) -> str:
