@@ -20,6 +20,7 @@ from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.split import grid_split, num_children
+from sadgs_ns.render.blending import blend
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
@@ -135,12 +136,13 @@ def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a structure-aware step without its pruning, as `_try`."""
     counts = model.strategy.planned_children(model.gauss_params, statistics)
-    return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
+    return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.options.child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a step of AbsGS, clones and splits in two, without its pruning, as `_try`."""
-    strategy = replace(model.strategy, absgs_long_axis=False)
+    options = replace(model.plan.strategy, absgs_long_axis=False)
+    strategy = options.for_run(model.plan.iterations)
     state = {**gradients, "scene_scale": model.strategy_state["scene_scale"]}
     densify = partial(apply, *strategy.planned_growth(absgs, model.gauss_params, state))
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):
@@ -186,7 +188,7 @@ def step_panels(
     camera = Pinholes(viewmats, Ks * Ks.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = maps.blend(params, its_colors, camera, model.drawing)
+        render, _ = blend(params, its_colors, camera, model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [

@@ -11,14 +11,14 @@ import re
 import shutil
 import signal
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from sadgs_ns.errors import RunError, free_space
+from sadgs_ns.placing.options import Report
 from sadgs_ns.worker import Worker, WorkerError
 
-Report = Callable[[str, int, int], None]  # Called with a stage's name, the work that is done, and all its work
 _FULL_DISK = re.compile("no space left|disk is full|disk I/O error|file too large|failed to write", re.IGNORECASE)
 _FULL_BELOW = 8 * 2**20  # Free bytes under which a disk counts as full
 _LOG_PREFIX = re.compile(r"^([IWEF]\d{8} .*?\] |\s*what\(\):\s*)?(\[[\w.]+:\d+\] )?(Check failed: (\S+\(\) )?)?")

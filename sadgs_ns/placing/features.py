@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from sadgs_ns.data.checks.images import image_size
+from sadgs_ns.data.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.host_memory import available_host_bytes
 from sadgs_ns.placing.panoramas import VIEWS, rotations

@@ -14,12 +14,11 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.cli.program import read_settings
-from sadgs_ns.data import IMAGE_SUFFIXES
-from sadgs_ns.data.checks.colmap import automatic_options
-from sadgs_ns.data.checks.images import image_size
-from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
+from sadgs_ns.data.images import IMAGE_SUFFIXES, image_size
+from sadgs_ns.data.layouts import automatic_options
+from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
+from sadgs_ns.files import read_settings
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}

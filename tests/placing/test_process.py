@@ -40,16 +40,20 @@ from rich.progress import Progress
 
 from helpers.drawn_photos import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
 from sadgs_ns.cli import process as program
-from sadgs_ns.cli.process import Process, Scene, main, process
-from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.cli.process import Process, main, process
 from sadgs_ns.data.checks.transforms import check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError, RunError
-from sadgs_ns.placing import features, reconstruct
+from sadgs_ns.placing import features, place, reconstruct
+from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
+from sadgs_ns.placing.conversion import convert_photos, write_masks
 from sadgs_ns.placing.folder import find_source, look_into
-from sadgs_ns.placing.photos import Photo, convert_photos, photos_by_camera, read_photos, write_masks
+from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
 from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
+from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
+from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.video import sharpest_frames, video_frames
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.worker import Worker
@@ -160,8 +164,7 @@ def test_photos_are_registered_where_they_were_taken(run: Run):
 def test_all_points_and_cameras_are_adjusted_at_the_end(run: Run):
     model = pycolmap.Reconstruction(run.out / "work" / "model")
     error = model.compute_mean_reprojection_error()
-    pycolmap.bundle_adjustment(model)
-    model.update_point_3d_errors()
+    adjust_robustly(model)
     assert error == pytest.approx(model.compute_mean_reprojection_error(), rel=3e-4)
 
 
@@ -212,14 +215,14 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: int, stretch: float
 ):
     shutil.copy(run.out / "work" / "database.db", tmp_path)
-    mapping, adjustment, angles = pycolmap.incremental_mapping, pycolmap.bundle_adjustment, []
+    mapping, angles = pycolmap.incremental_mapping, []
 
     def note_the_angle(*arguments: Any, **callbacks: Any) -> Any:
         angles.append(arguments[3].mapper.init_min_tri_angle)
         return mapping(*arguments, **callbacks)
 
-    def spoil_the_first(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-        adjustment(model, options)
+    def spoil_the_first(model: pycolmap.Reconstruction, *fixed: Any) -> None:
+        adjust_robustly(model, *fixed)
         if len(angles) == 1:
             for frame in list(model.frames)[registered:]:
                 model.deregister_frame(frame)
@@ -227,7 +230,7 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
                 camera.focal_length_x *= stretch
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", note_the_angle)
-    monkeypatch.setattr(pycolmap, "bundle_adjustment", spoil_the_first)
+    monkeypatch.setattr(reconstruct, "adjust_robustly", spoil_the_first)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
@@ -591,7 +594,7 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
         masks.update((path.name, Image.open(path).getextrema()) for path in (out / "work").glob("masks/*"))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.process.make_model", look)
+    monkeypatch.setattr("sadgs_ns.placing.place.make_model", look)
     assert main([str(source), str(out)]) == 130
     assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
@@ -933,8 +936,8 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
             (folder / "database.db").write_bytes(b"features")
             return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
 
-        monkeypatch.setattr("sadgs_ns.cli.process.make_model", stand_in)
-        monkeypatch.setattr(program, "_publish", lambda *others: None)
+        monkeypatch.setattr("sadgs_ns.placing.place.make_model", stand_in)
+        monkeypatch.setattr(place, "publish", lambda *others: None)
 
     return register
 
@@ -968,7 +971,7 @@ def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
     (folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": f"images/{n}.png"} for n in "ab"]}))
     (folder / "images" / "b.png").write_bytes((folder / "images" / "b.png").read_bytes()[:30])
     with pytest.raises(OSError, match=r"images could not be written \(the disk is full; .* free there"):
-        program._publish(folder, tmp_path, grown=False)
+        publish(folder, tmp_path, grown=False)
 
 
 @pytest.mark.hard_case("two runs in one folder at a time", "the second is refused")
@@ -980,7 +983,7 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
         assert main(command) == 2 and (folder / "models").is_dir()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.process.make_model", run_another)
+    monkeypatch.setattr("sadgs_ns.placing.place.make_model", run_another)
     assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
@@ -1026,13 +1029,13 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
 )
 def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
-    imports = "import sys; from sadgs_ns.cli.cameras import command"
+    imports = "import sys; from sadgs_ns.cli import process"
     code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_features_are_found_while_torch_is_imported():
-    imports = "import sys; from sadgs_ns.cli.cameras import reconstruct"
+    imports = "import sys; from sadgs_ns.placing import reconstruct"
     subprocess.run([sys.executable, "-c", f"{imports}; assert 'torch' not in sys.modules"], check=True)
 
 
@@ -1257,7 +1260,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sadgs_ns.cli.process.make_model", stop)
+    monkeypatch.setattr("sadgs_ns.placing.place.make_model", stop)
     return runs
 
 
@@ -1272,7 +1275,7 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
         patched.setattr("sadgs_ns.placing.video.sharpest_frames", interrupted)
         assert main(command) == 130 and not list((tmp_path / "out").rglob("*.jpg"))
     assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
-    monkeypatch.setattr(program, "video_frames", None)  # a third run reads none again
+    monkeypatch.setattr(place, "video_frames", None)  # a third run reads none again
     assert main(command) == 130 and taken[0] == taken[1]
 
 
@@ -1403,7 +1406,8 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     assert process(Process(source, out, max_size=120)).registered == 8
     described = json.loads((out / "transforms.json").read_text())
     widths = {frame["file_path"]: frame["w"] for frame in described["frames"]}
-    assert "w" not in described and widths.pop("images/09.png") == 120 and set(widths.values()) == {before["w"]}
+    # Without distortion, an image can be a column narrower than its photo.
+    assert "w" not in described and widths.pop("images/09.png") in (119, 120) and set(widths.values()) == {before["w"]}
 
 
 @pytest.mark.hard_case(

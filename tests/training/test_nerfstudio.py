@@ -503,7 +503,7 @@ def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataPa
     code = f"""
 import os, signal, torch
 from pathlib import Path
-from sadgs_ns.training import checkpoints
+from sadgs_ns.training.run import checkpoints
 def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -558,7 +558,9 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
         pipeline.follow(dataclasses.replace(pipeline.model.plan, views_per_iteration=len(indices)))
         pipeline.views.sampler.requeue(indices)
         update = AdamUpdate({"means": FusedAdam([model.means], lr=0.0)})
-        return training_step(model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.slot).loss
+        return training_step(
+            model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.nonfinite_flag
+        ).loss
 
     alone = [loss(index) for index in range(5)]
     assert len({round(float(value), 4) for value in alone}) == 5

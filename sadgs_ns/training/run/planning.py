@@ -104,7 +104,7 @@ def plan_run(
     of_effort, of_start = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
     clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
-    planned = planned.for_run(length.iterations)
+    planned = planned.fitted(length.iterations)
     windows = planned.windows
     if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
         warn(

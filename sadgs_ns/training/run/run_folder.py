@@ -12,7 +12,7 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.data.parsers import check_capture, keep_findings
+from sadgs_ns.data.checks.capture import check_ahead
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
 from sadgs_ns.training.run import checkpoints, processes
@@ -27,9 +27,8 @@ def begin(config: TrainerConfig) -> None:
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)
     data: Any = config.pipeline.datamanager
-    findings = check_capture(data)
+    check_ahead(data)
     CONSOLE.log(f"Saving config to: {write_config(config)}")
-    keep_findings(data, findings)  # After writing, so that `config.yml` holds none.
 
 
 def write_config(config: TrainerConfig) -> Path:

@@ -198,10 +198,12 @@ class SadgsTrainer(Trainer):
             model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
         groups, update = pipeline.next_views(step), self.optimizers.update()
         inputs = groups, model.opacity_reg_now, update
-        factors, slot = update.factors(), pipeline.log.slot
-        result = None if graphed is None else graphed.replay(*inputs, factors, slot)
+        factors = update.factors()
+        nonfinite_flag = pipeline.log.nonfinite_flag
+        result = None if graphed is None else graphed.replay(*inputs, factors, nonfinite_flag)
         if result is None:
-            result = training_step(model, *inputs, factors.to(update.device, non_blocking=True), slot)
+            factors = factors.to(update.device, non_blocking=True)
+            result = training_step(model, *inputs, factors, nonfinite_flag)
         pipeline.finish_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
         metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}

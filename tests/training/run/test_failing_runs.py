@@ -26,8 +26,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
-from helpers.kill_and_resume import differences, parser_of
-from helpers.short_runs import checkpoint, configure, is_finite, set_up, train
+from helpers.kill_and_resume import differences, parser_of, set_up
+from helpers.short_runs import checkpoint, configure, is_finite, train
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
