@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sadgs_ns import events, interrupts
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.interrupts import SIGNALS, Interrupted, Interrupts
+from sadgs_ns.interrupts import Interrupted, Interrupts
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.kernels_ahead import compile_ahead
@@ -31,6 +31,7 @@ from sadgs_ns.training.run.preparation import prepare_run
 from sadgs_ns.training.run.progress import next_commands, note, remove_tables
 from sadgs_ns.training.run.resume import Resumption
 from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.step_requests import StepRequests
 from sadgs_ns.training.step.cuda_graphs import GraphedSteps
 from sadgs_ns.training.step.optimizers import SadgsOptimizers
 from sadgs_ns.training.step.train_step import training_step
@@ -189,10 +190,9 @@ class SadgsTrainer(Trainer):
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
         self._stepping = True
-        # Several processes agree in the step what to do after it. A signal has the bit of its number.
-        self.world.flags_in, signalled = 0, self._interrupts.received
-        bit = 0 if signalled is None else 1 << signalled
-        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
+        # Several processes agree in the step what to do after it.
+        self.world.flags_in = 0
+        self.world.flags_out = self._own_requests().encode()
         pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
         if graphed is not None and model.tile_forecast is not None:
             model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
@@ -210,19 +210,31 @@ class SadgsTrainer(Trainer):
         model.camera_optimizer.get_metrics_dict(metrics)
         return result.loss, {"main_loss": result.loss}, metrics
 
+    def _own_requests(self) -> StepRequests:
+        """Return what this process asks of all."""
+        signals: tuple[int, ...] = ()
+        if self._interrupts.received is not None:
+            signals = (self._interrupts.received,)
+        return StepRequests(save=self._save_is_due(), signals=signals)
+
+    def _save_is_due(self) -> bool:
+        """Tell whether a checkpoint is due by this process's clock."""
+        return time.monotonic() >= self._save_due
+
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
-        self._completed_step, self._stepping = step, False
+        self._completed_step = step
+        self._stepping = False
         if self.world.alone:
             self._interrupts.poll()
-            due = time.monotonic() >= self._save_due
+            save_is_due = self._save_is_due()
         else:
-            due = bool(self.world.flags_in & 1)
-            for number in SIGNALS:
-                if self.world.flags_in >> number & 1:
-                    raise Interrupted(number)
+            requests = StepRequests.decode(self.world.flags_in)
+            if requests.signals:
+                raise Interrupted(requests.signals[0])
+            save_is_due = requests.save
         self._stop_if_diverged()
-        if due:
+        if save_is_due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
 
