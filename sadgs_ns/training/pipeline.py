@@ -149,6 +149,11 @@ class SadgsPipeline(VanillaPipeline):
         if self.log.full:
             self._report_nonfinite()
 
+    def clear_paths(self, near_plane: float) -> None:
+        """Let densification prune haze near the training cameras' paths, as `SadgsModel.clear_paths` says."""
+        cameras = self.datamanager.train_dataset.cameras
+        self.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds), near_plane)
+
     def check_visibility(self, near_plane: float) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras

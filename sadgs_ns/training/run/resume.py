@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import TrainerConfig
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -31,6 +32,15 @@ class Resumption:
 
     path: Path
     state: dict[str, Any]  # As nerfstudio's trainer writes it
+
+    @classmethod
+    def chosen_by(cls, config: TrainerConfig) -> Resumption | None:
+        """Read the checkpoint that nerfstudio's options for resuming name; None if they name none."""
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        if chosen is None:
+            return None
+        path, state = chosen
+        return cls(path, state)
 
     @contextmanager
     def _errors_name_file(self) -> Iterator[None]:

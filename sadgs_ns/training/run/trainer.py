@@ -19,21 +19,19 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns import events, interrupts
-from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.interrupts import SIGNALS, Interrupted, Interrupts
+from sadgs_ns.interrupts import Interrupted, Interrupts
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.kernels_ahead import compile_ahead
 from sadgs_ns.training.kernels_ahead.compilation import compile_kernels
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints, processes
-from sadgs_ns.training.run.planning import decide_near_plane, one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.run.preparation import prepare_run
 from sadgs_ns.training.run.progress import next_commands, note, remove_tables
 from sadgs_ns.training.run.resume import Resumption
 from sadgs_ns.training.run.run_folder import write_config
-from sadgs_ns.training.run.stereo_start import start_from_stereo
+from sadgs_ns.training.run.step_requests import StepRequests
 from sadgs_ns.training.step.cuda_graphs import GraphedSteps
 from sadgs_ns.training.step.optimizers import SadgsOptimizers
 from sadgs_ns.training.step.train_step import training_step
@@ -56,6 +54,7 @@ class SadgsTrainer(Trainer):
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         interrupts.redirect_on_broken_pipe(CONSOLE)
         config.check()
+        # Only fields of this copy itself are changed; all that they refer to is the caller's.
         config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
         if config.machine.device_type == "cuda" and local_rank == 0:
             compile_ahead.begin()
@@ -64,7 +63,6 @@ class SadgsTrainer(Trainer):
         if not self.world.alone:
             with processes.local_rank_zero_first(self.world, local_rank):
                 use_triton(self.world.device)  # This compiles a kernel.
-        config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
         self._vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
         super().__init__(config, local_rank, world_size=1)
@@ -124,37 +122,15 @@ class SadgsTrainer(Trainer):
         self._resumed = None
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Load the Gaussians of a checkpoint, if there is one, plan the run, and build its optimizers."""
+        """Prepare the run, as `prepare_run` says, and build its optimizers."""
         config, pipeline = self.config, self.pipeline
-        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        self._resumed = resumed = None if chosen is None else Resumption(*chosen)
-        before = None if resumed is None else resumed.plan
-        near_plane = decide_near_plane(pipeline, before)
-        dense = start_from_stereo(pipeline, resumed=resumed is not None)
-        cameras = pipeline.datamanager.train_dataset.cameras
-        if resumed is None:
-            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds), near_plane)
-        length = plan_length(config, len(cameras), before)
-        peers, views = None if config.share_always else self._peers, length.views_per_iteration
-        if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
-            processes.continue_on_rank_zero(self.world, peers)
-            self.world, self._peers = World(), None
-        if not self.world.alone:
-            if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
-                note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
-                others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
-                config.vis = others or "none"  # type: ignore[assignment]
-            pipeline.model.shard(self.world)
-        if resumed is not None:
-            resumed.load_gaussians(pipeline, self.world)
-            self._start_step = resumed.state["step"] + 1
-        pipeline.check_visibility(near_plane)
-        plan = plan_run(
-            config, pipeline, length, near_plane=near_plane, dense=dense, before=before, done=self._start_step
-        )
-        pipeline.follow(plan)
-        config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
-        return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
+        run = prepare_run(config, pipeline, self.world, self._peers)
+        self.world = run.world
+        self._peers = run.peers
+        self._resumed = run.resumed
+        self._start_step = run.start_step
+        config.max_num_iterations = run.plan.iterations  # nerfstudio's loop and table read it.
+        return SadgsOptimizers(run.plan.optimizers(config.optimizers), pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
@@ -214,10 +190,9 @@ class SadgsTrainer(Trainer):
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
         self._stepping = True
-        # Several processes agree in the step what to do after it. A signal has the bit of its number.
-        self.world.flags_in, signalled = 0, self._interrupts.received
-        bit = 0 if signalled is None else 1 << signalled
-        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
+        # Several processes agree in the step what to do after it.
+        self.world.flags_in = 0
+        self.world.flags_out = self._own_requests().encode()
         pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
         if graphed is not None and model.tile_forecast is not None:
             model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
@@ -235,19 +210,31 @@ class SadgsTrainer(Trainer):
         model.camera_optimizer.get_metrics_dict(metrics)
         return result.loss, {"main_loss": result.loss}, metrics
 
+    def _own_requests(self) -> StepRequests:
+        """Return what this process asks of all."""
+        signals: tuple[int, ...] = ()
+        if self._interrupts.received is not None:
+            signals = (self._interrupts.received,)
+        return StepRequests(save=self._save_is_due(), signals=signals)
+
+    def _save_is_due(self) -> bool:
+        """Tell whether a checkpoint is due by this process's clock."""
+        return time.monotonic() >= self._save_due
+
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
-        self._completed_step, self._stepping = step, False
+        self._completed_step = step
+        self._stepping = False
         if self.world.alone:
             self._interrupts.poll()
-            due = time.monotonic() >= self._save_due
+            save_is_due = self._save_is_due()
         else:
-            due = bool(self.world.flags_in & 1)
-            for number in SIGNALS:
-                if self.world.flags_in >> number & 1:
-                    raise Interrupted(number)
+            requests = StepRequests.decode(self.world.flags_in)
+            if requests.signals:
+                raise Interrupted(requests.signals[0])
+            save_is_due = requests.save
         self._stop_if_diverged()
-        if due:
+        if save_is_due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
 

@@ -80,6 +80,10 @@ class TrainingViews:
         self.model = model
         self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
 
+    def seed(self, seed: int) -> None:
+        """Begin anew with rounds of views in an order that this seed decides."""
+        self.sampler = ViewSampler(len(self), seed)
+
     def __len__(self) -> int:
         """Number of training views."""
         return self.sampler.num_views
