@@ -21,7 +21,7 @@ test: $(STAMP)
 # ATEN_CPU_CAPABILITY=default keeps torch from its AVX2 and AVX-512 kernels, which round differently. A test that
 # fails in only one of `test` and `test-portable` depends on the processor.
 test-portable: $(STAMP)
-	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) tests/method tests/render
+	ATEN_CPU_CAPABILITY=default OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) tests/method tests/geometry tests/render
 
 # On the CPU, with one thread a run (results depend on their number), and without LPIPS, whose weights are a download.
 gate: $(STAMP)

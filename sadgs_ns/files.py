@@ -1,13 +1,17 @@
-"""Writing files so that they appear complete or not at all."""
+"""Files that appear complete or not at all, settings in JSON, and folders that only one process uses."""
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
-from sadgs_ns.errors import WriteError
+from sadgs_ns.errors import InputError, WriteError, reason
 
 
 @contextmanager
@@ -29,3 +33,38 @@ def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # Even its folder may be missing.
             partial.unlink(missing_ok=True)
+
+
+def read_settings(file: Path, folder: Path) -> dict[str, Any]:
+    """Return the settings of a folder, none if their file does not exist; raise InputError if it is damaged."""
+    try:
+        return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
+    except ValueError as error:
+        raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
+
+
+def write_json(file: Path, value: Any) -> None:
+    """Write JSON as `atomic_path` does."""
+    with atomic_path(file) as partial:
+        partial.write_text(json.dumps(value), "utf8")
+
+
+@contextmanager
+def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
+    """Lock a folder until all processes with the yielded file descriptor have ended.
+
+    Raise InputError with the message `refusal` if the folder does not become free in these seconds.
+    """
+    lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
+    try:
+        while True:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as error:
+                if time.monotonic() > end:
+                    raise InputError(refusal) from error
+                time.sleep(0.2)
+        yield lock
+    finally:
+        os.close(lock)

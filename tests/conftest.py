@@ -105,9 +105,8 @@ def close_loggers() -> None:
 @pytest.fixture(scope="session")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small drawn COLMAP dataset, to be read only."""
-    from scenes import HEIGHT, POINTS, VIEWS, WIDTH
-
     from examples.drawn_scene.scene import write_scene
+    from helpers.small_scenes import HEIGHT, POINTS, VIEWS, WIDTH
 
     folder = tmp_path_factory.mktemp("colmap") / "scene"
     write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)
@@ -126,7 +125,7 @@ def open3d() -> None:
 @pytest.fixture
 def colmap(scene: Path) -> ColmapDataParserConfig:
     """The scene's parser, with every 8th view held out."""
-    from kill_and_resume import parser_of
+    from helpers.kill_and_resume import parser_of
 
     return parser_of(scene)
 
@@ -134,7 +133,7 @@ def colmap(scene: Path) -> ColmapDataParserConfig:
 @pytest.fixture
 def config(scene: Path, tmp_path: Path) -> SadgsTrainerConfig:
     """A run on the scene of a few iterations that saves only at its end."""
-    from kill_and_resume import configure
-    from scenes import ITERATIONS
+    from helpers.kill_and_resume import configure
+    from helpers.small_scenes import ITERATIONS
 
     return configure(scene, tmp_path, ITERATIONS, save_every=0)

@@ -26,8 +26,8 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training import presets
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.structure_cache import observe_training_views
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import ETA, PERIOD, Panel, to_picture
 

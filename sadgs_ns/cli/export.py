@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need n
     from torch import Tensor
 
     from sadgs_ns.data.run_cameras import RunCameras
-    from sadgs_ns.method.cleaning import Cleaning
+    from sadgs_ns.geometry.cleaning import Cleaning
     from sadgs_ns.render.types import RenderOptions
 
 Box = tuple[float, float, float, float, float, float]  # Lowest x, y and z, and highest
@@ -97,7 +97,7 @@ def export(options: Export) -> int:
         load_open3d()  # It may be missing, which the user shall know before views are rendered.
     folders = _checkpoint_of(options.run).absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
-    from sadgs_ns.method.cleaning import Cleaning  # It imports torch.
+    from sadgs_ns.geometry.cleaning import Cleaning  # It imports torch.
 
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
     similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
@@ -148,7 +148,7 @@ def _cleaned(
     from rich.console import Console
     from rich.progress import track
 
-    from sadgs_ns.method.cleaning import Cleaning, find_remaining, measure_visibility
+    from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
     from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
     if cleaning == Cleaning():
@@ -191,7 +191,7 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     from torch import Tensor
 
     from sadgs_ns.render.types import RenderOptions
-    from sadgs_ns.training import checkpoints
+    from sadgs_ns.training.run import checkpoints
 
     checkpoint = _checkpoint_of(run)
     folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)

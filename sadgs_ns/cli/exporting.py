@@ -9,13 +9,13 @@ import scipy.cluster.vq  # noqa: F401 - for pages; `export` itself imports it, a
 
 from sadgs_ns.cli.export import Export, export
 from sadgs_ns.events import report
-from sadgs_ns.training.deferred_imports import import_nerfstudio
+from sadgs_ns.training.run.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # It precedes what imports nerfstudio.
 
 from sadgs_ns.data import parsers, run_cameras  # noqa: E402, F401
-from sadgs_ns.method import cleaning  # noqa: E402, F401
-from sadgs_ns.training import checkpoints  # noqa: E402, F401
+from sadgs_ns.geometry import cleaning  # noqa: E402, F401
+from sadgs_ns.training.run import checkpoints  # noqa: E402, F401
 
 
 def export_all(jobs: Sequence[Export]) -> None:

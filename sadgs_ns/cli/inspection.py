@@ -20,12 +20,13 @@ from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.split import grid_split, num_children
+from sadgs_ns.render.blending import blend
 from sadgs_ns.render.types import Cameras as Pinholes
-from sadgs_ns.training import checkpoints
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.structure_cache import observe_training_views
+from sadgs_ns.training.run import checkpoints
+from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 
@@ -186,7 +187,7 @@ def step_panels(
     camera = Pinholes(viewmats, Ks * Ks.new_tensor([[enlarge], [enlarge], [1.0]]), enlarge * width, enlarge * height)
 
     def panel(title: str, params: Any, its_colors: Tensor) -> Panel:
-        render, _ = maps.blend(params, its_colors, camera, model.drawing)
+        render, _ = blend(params, its_colors, camera, model.drawing)
         return Panel(f"{title}: {len(params['means']):,} Gaussians", to_picture(render))
 
     return [

@@ -1,24 +1,18 @@
-"""Functions of all commands: a command line that tyro reads, an exit code, and a folder that only one command uses."""
+"""Functions of all commands: a command line that tyro reads, and an exit code."""
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import json
-import os
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import tyro
 
 from sadgs_ns.errors import InputError, RunError, free_space, reason
-from sadgs_ns.files import atomic_path
-from sadgs_ns.training.interrupts import Interrupted
+from sadgs_ns.interrupts import Interrupted
 
 Options = TypeVar("Options")
 
@@ -55,38 +49,3 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
         code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
     print(f"{name}: {told}", file=sys.stderr)
     return code
-
-
-def read_settings(file: Path, folder: Path) -> dict[str, Any]:
-    """Return the settings of a folder, none if their file does not exist; raise InputError if it is damaged."""
-    try:
-        return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
-    except ValueError as error:
-        raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
-
-
-def write_json(file: Path, value: Any) -> None:
-    """Write JSON as `atomic_path` does."""
-    with atomic_path(file) as partial:
-        partial.write_text(json.dumps(value), "utf8")
-
-
-@contextlib.contextmanager
-def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
-    """Lock a folder until all processes with the yielded file descriptor have ended.
-
-    Raise InputError with the message `refusal` if the folder does not become free in these seconds.
-    """
-    lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
-    try:
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if time.monotonic() > end:
-                    raise InputError(refusal) from error
-                time.sleep(0.2)
-        yield lock
-    finally:
-        os.close(lock)

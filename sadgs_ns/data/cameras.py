@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from sadgs_ns.data.checks.geometry import NO_COEFFICIENTS
+from sadgs_ns.data.views import NO_COEFFICIENTS
 from sadgs_ns.errors import InputError
 
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)

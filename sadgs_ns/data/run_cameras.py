@@ -63,8 +63,9 @@ def _parser(settings: Mapping[str, Any], data: Path) -> Any:
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 
-    from sadgs_ns.data.checks.images import automatic_factor
-    from sadgs_ns.data.parsers import OWN, PARSERS, AutomaticDataParserConfig, choose_parser
+    from sadgs_ns.data.images import automatic_factor
+    from sadgs_ns.data.own_parsers import OWN
+    from sadgs_ns.data.parsers import PARSERS, AutomaticDataParserConfig, choose_parser
 
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
     parser: Any = copy.deepcopy(known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig()))

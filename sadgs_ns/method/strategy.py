@@ -15,11 +15,11 @@ from torch import Tensor
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.growth import RULES, Proposal, Propose, Rule, apply, due_rule, structure_aware
-from sadgs_ns.method.memory import StepSize, affordable_growth, free_bytes
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due, windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
 from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+from sadgs_ns.render.step_memory import StepSize, affordable_growth, free_bytes
 
 Info = Mapping[str, Any]
 Infos = Info | Sequence[Info]  # gsplat's info of the views of a step, or a list with one for each image size
@@ -84,14 +84,18 @@ class StructureAwareStrategy(Strategy):
     """The processes among which the Gaussians are shared out.
     The cap and the ranking are those of all processes, and densification ends with equal shards."""
 
+    def fitted(self, num_iterations: int) -> StructureAwareStrategy:
+        """Return these options for a run of some length, from which the windows that are None are derived."""
+        return replace(self, **asdict(windows(num_iterations, **self._given)))
+
     def for_run(self, num_iterations: int, world: World | None = None) -> StructureAwareStrategy:
         """Return this strategy fitted to a run: windows that are None are derived from the run's length.
 
         `world` are the processes among which the Gaussians are shared out; None keeps this strategy's.
         """
-        derived = windows(num_iterations, **self._given)
-        fitted = replace(self, **asdict(derived))
-        fitted._fitted, fitted.world = derived, self.world if world is None else world
+        fitted = self.fitted(num_iterations)
+        fitted._fitted = fitted.windows
+        fitted.world = self.world if world is None else world
         return fitted
 
     @property

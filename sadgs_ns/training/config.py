@@ -24,19 +24,19 @@ from tyro.conf import Suppress
 
 from sadgs_ns.data.parsers import AnyParserConfig, AutomaticDataParserConfig
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.geometry.initialization import POINT_OPACITY
 from sadgs_ns.kernels import SWITCH, switched_off
-from sadgs_ns.method.initialization import POINT_OPACITY
 from sadgs_ns.method.quantization import HIGHEST_FREQUENCY
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.render.rasterization import choose_backend
 from sadgs_ns.render.types import BackendName
-from sadgs_ns.training import processes
-from sadgs_ns.training.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
 from sadgs_ns.training.options import check_ranges, hide
-from sadgs_ns.training.progress import ProgressTable
-from sadgs_ns.training.run_folder import begin
+from sadgs_ns.training.run import processes
+from sadgs_ns.training.run.progress import ProgressTable
+from sadgs_ns.training.run.run_folder import begin
+from sadgs_ns.training.step.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
 
 _MOST_RANDOM = 10_000_000  # Most random points to start from: they take the host's memory before the cap thins them out
 _WIDEST_BLUR = 100  # Largest window of `energy_blur`, which makes kernels of thousands of pixels

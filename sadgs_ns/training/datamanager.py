@@ -18,9 +18,10 @@ from torch import Tensor
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.parsers import OWN, choose_parser
+from sadgs_ns.data.own_parsers import OWN
+from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError
-from sadgs_ns.training.images import LazyImages, thread_count
+from sadgs_ns.training.step.images import LazyImages, thread_count
 
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):

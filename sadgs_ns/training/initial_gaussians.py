@@ -10,10 +10,10 @@ import torch
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
 from torch import Tensor
 
-from sadgs_ns.method.initialization import plausible_points, starting_points
-from sadgs_ns.outliers import POINT_SHARE, REACH
+from sadgs_ns.geometry.initialization import plausible_points, starting_points
+from sadgs_ns.geometry.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
-from sadgs_ns.training.progress import warn
+from sadgs_ns.training.run.progress import warn
 
 
 def initial_gaussians(

@@ -9,7 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
-from sadgs_ns.training.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.training.step.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 
 RATES: dict[str, tuple[float, float, float]] = {
     "means": (1.6e-4, 1.0, 0.01),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -11,10 +10,9 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, Vie
 from torch import Tensor
 
 from sadgs_ns.errors import reason
-from sadgs_ns.method.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+from sadgs_ns.viewer.shown_run import ShownRun
 
 OUTPUT = "cleaned"  # Name of the panel's picture among the viewer's output types
 OFF, STAYS, GOES = "off", "what stays", "what goes"
@@ -25,9 +23,9 @@ NEAREST, FURTHEST = (-100.0, -100.0, -100.0), (100.0, 100.0, 100.0)
 class CleaningPanel(torch.nn.Module):
     """The panel's elements and picture. It is a module because the viewer looks for elements in modules only."""
 
-    def __init__(self, views: TrainingViews) -> None:
+    def __init__(self, run: ShownRun) -> None:
         super().__init__()
-        self._views = views
+        self._run = run
         self._seen: tuple[tuple[int, int], Visibility] | None = None
         self._stays = torch.ones(0, dtype=torch.bool)
         self._shown, self._text = OFF, ""
@@ -38,7 +36,9 @@ class CleaningPanel(torch.nn.Module):
         self.crop_to = ViewerVec3("crop to", FURTHEST, cb_hook=self._changed, hint="Highest x, y and z that stay")
         self.dust = self._slider("dust", 20.0, 0.1, "Pixels that a Gaussian must make up in some training view")
         self.max_extent = self._slider("max extent", 2.0, 0.01, "Longest standard deviation that stays; 0 is no limit")
-        self.min_views = self._slider("min views", len(views), 1, "Training views that must see a Gaussian")
+        self.min_views = self._slider(
+            "min views", len(run.datamanager.train_dataset), 1, "Training views that must see a Gaussian"
+        )
         self.text = ViewerMarkdown("taken away", lambda: self._text)
         self.viewer = ViewerControl()
 
@@ -58,19 +58,19 @@ class CleaningPanel(torch.nn.Module):
             self.refresh()
         except (RuntimeError, ValueError) as error:  # Memory is full, the box is reversed, or photos went away.
             self._say(f"The picture stays as it was: {reason(error)}.")
-            warn(self._text)
+            self._run.warn(self._text)
             return
         show_output(self.viewer, "rgb" if self._shown == OFF else OUTPUT)
 
     def refresh(self) -> None:
         """Find which Gaussians stay, and show how many; raises InputError if the box is reversed."""
-        cleaning, views, model = self.cleaning, self._views, self._views.model
+        cleaning, model = self.cleaning, self._run.model
         params = dict(model.gauss_params.items())
         now = (model.num_points, model.step)  # Training outdates what was seen.
         if cleaning.needs_views and (self._seen is None or self._seen[0] != now):
             self._say("Looking from all training views …")
-            poses = [(views.viewmat(i).detach(), views.cameras[1][i], w, h) for i, (h, w) in enumerate(views.sizes)]
-            self._seen = now, measure_visibility(params, poses, model.drawing)
+            cameras = [(view.viewmats[0], view.Ks[0], view.width, view.height) for view in self._run.view_cameras()]
+            self._seen = now, measure_visibility(params, cameras, model.drawing)
         stays, sentences = find_remaining(params, cleaning, None if self._seen is None else self._seen[1])
         self._stays, self._shown = stays, self.choice.value
         left = f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay."
@@ -84,16 +84,11 @@ class CleaningPanel(torch.nn.Module):
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return `cleaned` [H, W, 3] in [0, 1]; it is `rgb` once densification changed the Gaussians."""
-        model, stays = self._views.model, self._stays
+        model, stays = self._run.model, self._stays
         if self._shown == OFF or len(stays) != model.num_points:
             return {OUTPUT: rendered["rgb"]}
-        box, drawn = model.crop_box, stays if self._shown == STAYS else ~stays
-        drawn = drawn if box is None else drawn & box.within(model.means)
-        model.crop_box = SimpleNamespace(within=lambda means: drawn)  # type: ignore[assignment]
-        try:
-            return {OUTPUT: model.get_outputs(camera)["rgb"]}
-        finally:
-            model.crop_box = box
+        drawn = stays if self._shown == STAYS else ~stays
+        return {OUTPUT: model.get_outputs(camera, drawn)["rgb"]}
 
 
 def command_line_options(cleaning: Cleaning) -> str:

@@ -1,18 +1,12 @@
-"""Helpers of the model and the viewer's panels: lazy outputs, a text, and the output that the viewer shows."""
+"""Helpers of the viewer's panels: an element with a text, and the output that the viewer shows."""
 
 from __future__ import annotations
 
-import threading
-from collections import UserDict
 from collections.abc import Callable
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerElement
-from torch import Tensor
-
-from sadgs_ns.training.progress import warn
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -51,29 +45,3 @@ def shows_output(control: ViewerControl, name: str) -> bool:
         return False
     panel = viewer.control_panel
     return name == panel.output_render or (panel.split and name == panel.split_output_render)
-
-
-class LazyOutputs(UserDict[str, Any]):
-    """Tensors by name, or functions that make them when they are first read.
-
-    nerfstudio does not tell a model which outputs it needs, so each would cost `ns-eval` and `ns-render` time.
-    """
-
-    def __getitem__(self, name: str) -> Tensor:
-        value: Any = self.data[name]
-        if callable(value):
-            value = self.data[name] = value()
-        return value
-
-
-def in_viewer() -> bool:
-    """Tell whether nerfstudio's viewer draws in this thread."""
-    from nerfstudio.viewer.render_state_machine import RenderStateMachine
-
-    return isinstance(threading.current_thread(), RenderStateMachine)
-
-
-@lru_cache(maxsize=8)
-def warn_once(text: str) -> None:
-    """Print a warning, unless it was printed before."""
-    warn(text)

@@ -1,4 +1,4 @@
-"""Maps of the Gaussians' η, children, normals and chosen shares, and pictures of S̄: its period, and S̄⁻¹ as ellipses.
+"""Maps of the Gaussians' η, children and chosen shares, and pictures of S̄: its period, and S̄⁻¹ as ellipses.
 
 `params` are means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], by name. `camera` is a
 single one, and maps have its height and width. They are NaN where hardly anything with a value is drawn.
@@ -13,30 +13,17 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
-from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from sadgs_ns.method.eta import WAVELENGTH_EPSILON, wavelength
 from sadgs_ns.method.split import num_children
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCALE_STEP
-from sadgs_ns.render.rasterization import rasterize
-from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
+from sadgs_ns.render.blending import blend
+from sadgs_ns.render.types import DEFAULTS, Cameras, RenderOptions
 from sadgs_ns.viewer.color_scales import PERIOD, Picture
 
 ELLIPSES_ACROSS = 28  # Number of ellipses along an image's shorter side
 MIN_COVER = 0.05  # Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty
-
-
-@torch.no_grad()
-def blend(
-    params: Mapping[str, Tensor], values: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
-) -> tuple[Tensor, Tensor]:
-    """Blend values [N, D] of the Gaussians like colours. → [H, W, D], and the covered share of each pixel [H, W, 1]"""
-    opacities = torch.sigmoid(params["opacities"].flatten())
-    gaussians = Gaussians(params["means"], params["quats"], params["scales"].exp(), opacities, values)
-    render, alpha, _ = rasterize(gaussians, camera, drawing)
-    return render[0], alpha[0]
 
 
 def mean_map(
@@ -63,22 +50,6 @@ def children_map(
 ) -> Tensor:
     """Return the geometric mean of the Gaussians' numbers of children, ≥ 1 along each axis [N, 3]. [H, W]"""
     return mean_map(params, num_children(counts).float().log(), camera, drawing).exp()
-
-
-@torch.no_grad()
-def normals_map(params: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS) -> Tensor:
-    """Return the blended normals of the Gaussians, of unit length in world axes, 0 where nothing is drawn. [H, W, 3]
-
-    A Gaussian's normal is the axis of its smallest scale, turned towards the camera. This is an estimate, because
-    training does not flatten Gaussians; normals of the depth map are rougher (docs/guide.md has both measured).
-    """
-    rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"], dim=-1))  # [N, 3, 3]
-    thinnest = params["scales"].argmin(dim=1)[:, None, None].expand(-1, 3, 1)  # [N, 3, 1]
-    normals = rotmats.gather(2, thinnest)[..., 0]  # [N, 3]
-    viewmat = camera.viewmats[0]
-    rays = params["means"] + viewmat[:3, :3].T @ viewmat[:3, 3]  # [N, 3] from the camera's centre, −Rᵀ t
-    away = (rays * normals).sum(dim=1, keepdim=True) > 0
-    return F.normalize(blend(params, torch.where(away, -normals, normals), camera, drawing)[0], dim=-1)
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:

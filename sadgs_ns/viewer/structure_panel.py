@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -21,13 +21,10 @@ from torch import Tensor
 from sadgs_ns.errors import reason
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.progress import warn
-from sadgs_ns.training.run_plan import RunPlan
-from sadgs_ns.training.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
+from sadgs_ns.viewer.shown_run import Model, Plan, ShownRun
 
 OUTPUT = "structure"  # Name of the panel's picture among the viewer's output types
 OFF, ETA_OF, CHILDREN_OF, LOW_OF = "off", "η", "children", "low"
@@ -40,7 +37,10 @@ RANGES = {"tau_split": (0.0, 1.0), "max_gaussians": (1, 100_000_000)}
 ROWS = 8  # Number of the last structure steps in the table
 
 
-def changed(plan: RunPlan, name: str, value: float) -> RunPlan:
+AnyPlan = TypeVar("AnyPlan", bound=Plan)
+
+
+def changed(plan: AnyPlan, name: str, value: float) -> AnyPlan:
     """Return a plan with another value of one of `RANGES`' fields; raise ValueError if it is out of range."""
     low, high = RANGES[name]
     if not (isinstance(value, int | float) and math.isfinite(value) and low <= value <= high):
@@ -82,9 +82,9 @@ def nearest_view(cameras: Tensor, camera: Tensor, extent: float) -> int:
 class StructurePanel(torch.nn.Module):
     """The panel's elements and picture. It is a module because the viewer looks for elements in modules only."""
 
-    def __init__(self, cache: StructureCache) -> None:
+    def __init__(self, run: ShownRun) -> None:
         super().__init__()
-        self._cache = cache
+        self._run = run
         self._observed: dict[str, Tensor] = {}
         self._refreshed = 0.0
         self._status, self._shown, self._legend = "", OFF, ""
@@ -100,9 +100,9 @@ class StructurePanel(torch.nn.Module):
         self.viewer = ViewerControl()
 
     @property
-    def _model(self) -> SadgsModel:
+    def _model(self) -> Model:
         """The model; with a public name, the viewer would find its elements twice."""
-        return self._cache.views.model
+        return self._run.model
 
     def _describe(self) -> str:
         model = self._model
@@ -119,7 +119,7 @@ class StructurePanel(torch.nn.Module):
             if element.value != getattr(plan.strategy, name):
                 self._model.follow(changed(plan, name, element.value))
         except ValueError as error:
-            warn(str(error))
+            self._run.warn(str(error))
             element.value = getattr(plan.strategy, name)
         self.table.refresh()
 
@@ -130,7 +130,7 @@ class StructurePanel(torch.nn.Module):
             act()
         except (RuntimeError, ValueError) as error:  # Memory is full, or data went away.
             text = f"The viewer's panel stays as it was: {reason(error)}"
-            warn(text)
+            self._run.warn(text)
             self._say(text)
 
     def refresh(self) -> None:
@@ -150,11 +150,11 @@ class StructurePanel(torch.nn.Module):
 
     def observe_now(self) -> None:
         """Observe all training views with the present Gaussians, and show the progress above the table."""
-        number = len(self._cache.views)
+        number = len(self._run.datamanager.train_dataset)
         self._disable_button(True)
         try:
             self._read_photos()
-            self._observed = observe_training_views(self._cache, self._with_progress)
+            self._observed = self._run.observe(self._with_progress)
         finally:
             self._disable_button(False)
         seen = int((self._observed["n_total"] > 0).sum())
@@ -172,9 +172,9 @@ class StructurePanel(torch.nn.Module):
 
     def _read_photos(self) -> None:
         """Compute the structure tensors of the training photos, unless they were computed before."""
-        if not self._cache.filled:
+        if not self._run.structure_tensors.filled:
             self._say("Reading the training photos and their texture …")
-            self._cache.fill()
+            self._run.structure_tensors.fill()
 
     def _disable_button(self, disabled: bool) -> None:
         if self.observe.gui_handle is not None:
@@ -212,7 +212,7 @@ class StructurePanel(torch.nn.Module):
     @torch.no_grad()
     def picture(self, choice: str, camera: Cameras, rgb: Tensor) -> Panel:
         """Draw one of `CHOICES`, but not "off", for a camera, shape [1], that sees `rgb` [H, W, 3] in [0, 1]."""
-        cache, datamanager, (height, width) = self._cache, self._cache.views.datamanager, rgb.shape[:2]
+        cache, datamanager, (height, width) = self._run.structure_tensors, self._run.datamanager, rgb.shape[:2]
         constant = cache.frequency_constant
         if choice in OF_STATISTICS:
             return self._of_gaussians(choice, camera, width, height)

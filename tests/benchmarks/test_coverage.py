@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from scenes import camera
 from torch import Tensor
 
 from benchmarks.coverage import MAX_POINTS, Views, nearest_angles, thinned, uncovered_shares
+from helpers.small_scenes import camera
 
 DEPTH, IMAGE = 4.0, 64 / 60 * 4
 """Distance of the points that all cameras look at, and width of the images there."""

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import VIEWS
 
 from benchmarks import __main__ as bench
 from benchmarks.exposures import FILE, draw_gains, linear_light, srgb_values, with_gains
+from helpers.small_scenes import VIEWS
 
 
 def pixels(scene: Path, name: str) -> np.ndarray:

@@ -10,11 +10,11 @@ import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from scenes import VIEWS
 
 from benchmarks import __main__ as bench
 from benchmarks.datasets import image_names
 from benchmarks.validation import SPARSE
+from helpers.small_scenes import VIEWS
 
 
 def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_path: Path):

@@ -13,11 +13,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import processes
 import pytest
 import torch
 
 from examples.drawn_scene.scene import write_scene
+from helpers import forked_python
 from sadgs_ns import gsplat_compat, kernels
 from sadgs_ns.cli import doctor
 from sadgs_ns.data.checks.findings import Finding
@@ -67,7 +67,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 def test_it_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: Path):
     write_scene(tmp_path / "scene", 32, 24, 9, 20)
     code = f"from sadgs_ns.cli.doctor import main; raise SystemExit(main([{str(tmp_path / 'scene')!r}]))"
-    result = processes.python(code)
+    result = forked_python.python(code)
     lines = result.stdout.splitlines()
     assert lines[0].startswith(f"python {sys.version.split()[0]}, sadgs_ns ")
     for package in ("torch", "gsplat", "nerfstudio"):

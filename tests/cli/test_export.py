@@ -16,24 +16,24 @@ import torch
 import trimesh
 import yaml
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci, _spherical_harmonics
-from gsplat_like import splatted
 from hypothesis import given
 from hypothesis import strategies as st
-from kill_and_resume import configure, parser_of, set_up
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from plyfile import PlyData
-from runs import nerfstudio_data
 from scipy.spatial.transform import Rotation
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.gsplat_like import splatted
+from helpers.kill_and_resume import configure, parser_of, set_up
+from helpers.short_runs import nerfstudio_data
 from sadgs_ns.cli import export
 from sadgs_ns.cli.export import Export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import FORMATS, html
-from sadgs_ns.training.run_folder import write_config
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 PARAMS = {

@@ -15,10 +15,10 @@ import trimesh
 from plyfile import PlyData
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
-from surfaces import nearest
 
 from examples.drawn_scene.drawing import Sphere
 from examples.drawn_scene.scene import room_surfaces, write_scene
+from helpers.drawn_surfaces import nearest
 from sadgs_ns.cli import export, meshing
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.run_cameras import read_cameras

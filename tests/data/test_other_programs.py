@@ -17,12 +17,12 @@ import tyro
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
-from runs import blender_data, nerfstudio_data
-from scenes import HEIGHT, WIDTH
 
+from helpers.short_runs import blender_data, nerfstudio_data
+from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.layouts import poses_elsewhere
-from sadgs_ns.data.parsers import TransformsParser
+from sadgs_ns.data.own_parsers import TransformsParser
 from sadgs_ns.data.run_cameras import read_cameras
 
 # nerfstudio opens an image, to look for smaller copies of it, and leaves it open.

@@ -20,7 +20,6 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from kill_and_resume import set_up
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
@@ -30,15 +29,16 @@ from nerfstudio.data.utils import colmap_parsing_utils as colmap
 from nerfstudio.scripts.viewer.run_viewer import ViewerConfigWithoutNumRays
 from nerfstudio.utils.eval_utils import eval_load_checkpoint, eval_setup
 from PIL import Image
-from processes import HANGS
 from tyro import cli
 
 from benchmarks import protocol, run
 from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.forked_python import HANGS
+from helpers.kill_and_resume import set_up
 from sadgs_ns.training import presets
 from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 
 class Payload:

@@ -1,6 +1,7 @@
 """Two GPUs draw, differentiate and train what one does, over NCCL.
 
-The processes are started by torchrun, since those of tests/processes.py see no GPU; this module is their program.
+The processes are started by torchrun, since those of tests/helpers/forked_python.py see no GPU. This module is their
+program.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
-from sharded_scene import GAUSSIANS, inputs, splats, weights
 
+from helpers.sharded_rendering import GAUSSIANS, inputs, splats, weights
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
 from sadgs_ns.render.rasterization import rasterize as rasterize_alone
@@ -101,7 +102,7 @@ def test_a_run_on_two_gpus_ends_with_one_checkpoint(start: str, scene: Path, tmp
 @GPUS
 @pytest.mark.parametrize("tier", ["compressed", "cpu"])
 def test_two_gpus_train_on_images_of_several_sizes_that_are_on_the_host(tier: str, tmp_path: Path):
-    from runs import nerfstudio_data  # It imports nerfstudio, which the program below does without.
+    from helpers.short_runs import nerfstudio_data  # It imports nerfstudio, which the program below does without.
 
     parser = nerfstudio_data(tmp_path / "data", [(48, 36), (40, 30)], masks=True)
     result = run([

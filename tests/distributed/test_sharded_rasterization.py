@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 import torch
-from ranks import run_ranks
-from sharded_scene import GAUSSIANS, HEIGHT, inputs, splats, weights
 from torch import Tensor
 
+from helpers.gloo_ranks import run_ranks
+from helpers.sharded_rendering import GAUSSIANS, HEIGHT, inputs, splats, weights
 from sadgs_ns.distributed.bands import ROWS, share_rows, views_of_rank
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
@@ -21,7 +21,7 @@ from sadgs_ns.render.types import RenderOptions
 
 def draw_together(world: World, views: int, uneven: bool, fused: bool) -> dict[str, Any]:
     if fused:
-        from interpreted import use_our_rasterizer
+        from helpers.interpreted_rasterizer import use_our_rasterizer
 
         use_our_rasterizer(pytest.MonkeyPatch())
     part = world.take_even_part(GAUSSIANS)
@@ -64,7 +64,7 @@ def test_processes_draw_and_differentiate_what_one_does(
     if fused:
         if torch.cuda.is_available():
             pytest.skip("Triton is interpreted where there is no GPU")
-        pytest.importorskip("interpreted", reason="Triton is not installed", exc_type=ImportError)
+        pytest.importorskip("helpers.interpreted_rasterizer", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
     options = RenderOptions(sh_degree=1, absgrad=True, max_off_axis=1.5)
     colors, alphas, info = rasterize_alone(*splats(leaves, views), options)

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 import torch
-from ranks import run_ranks
 
+from helpers.gloo_ranks import run_ranks
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
@@ -92,8 +92,7 @@ def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Pa
 
 def prune_together(world: World) -> list[int]:
     """Numbers of Gaussians of this process after each of two prunings, and after the shards were evened out."""
-    strategy = StructureAwareStrategy()
-    strategy.world = world
+    strategy = StructureAwareStrategy().for_run(3000, world)
     means = torch.arange(12.0).view(4, 3) + 12 * world.rank
     params = {"means": torch.nn.Parameter(means), "opacities": torch.nn.Parameter(torch.ones(4))}
     optimizers = {name: torch.optim.Adam([parameter]) for name, parameter in params.items()}

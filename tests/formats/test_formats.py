@@ -20,13 +20,13 @@ from typing import Any
 import gsply
 import numpy as np
 import pytest
-from gaussians import random_gaussians
 from gsply.sog_reader import sogread
 from gsply.spz import read_spz
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from helpers.random_gaussians import random_gaussians
 from sadgs_ns import formats
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 from plyfile import PlyData
-from surfaces import depth_view, face_normals, nearest
 
 from examples.drawn_scene.scene import arc_views, room_surfaces
+from helpers.drawn_surfaces import depth_view, face_normals, nearest
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh

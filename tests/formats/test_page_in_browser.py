@@ -5,15 +5,15 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import browser
 import numpy as np
 import pytest
 import torch
-from browser import open_page
-from gaussians import random_gaussians
-from gsplat_like import splatted
 from PIL import Image
 
+from helpers import browser
+from helpers.browser import open_page
+from helpers.gsplat_like import splatted
+from helpers.random_gaussians import random_gaussians
 from sadgs_ns import formats
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats.gaussians import Context, Gaussians, Start

@@ -6,12 +6,12 @@ from typing import Any
 
 import gsplat
 import pytest
-import scenes
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
-from gsplat_like import rasterization
 from torch import Tensor
 
+from helpers import small_scenes
+from helpers.gsplat_like import rasterization
 from sadgs_ns import gsplat_compat
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -341,11 +341,11 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
     viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
     viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
-    Ks = scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
+    Ks = small_scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
     rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
     results, drawn = [], []
     for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
-        values = {name: p.detach() for name, p in scenes.random_params(60).items()} | {"rest": rest}
+        values = {name: p.detach() for name, p in small_scenes.random_params(60).items()} | {"rest": rest}
         values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
         colors: Any = values["features_dc"], values["rest"]
         geometry = values["means"], values["quats"], values["scales"].exp(), torch.sigmoid(values["opacities"])

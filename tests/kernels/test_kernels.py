@@ -14,13 +14,13 @@ from typing import Any
 import gsplat
 import numpy as np
 import pytest
-import scenes
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
-from gsplat_like import rasterization
-from random_scene import random_scene
 from torch import Tensor
 
+from helpers import small_scenes
+from helpers.gsplat_like import rasterization
+from helpers.rendered_scene import random_scene
 from sadgs_ns import kernels
 from sadgs_ns.method import losses, structure_tensor
 from sadgs_ns.method.quantization import quantize
@@ -30,7 +30,7 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.off_axis import cull_off_axis
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
 
 triton = pytest.importorskip("triton", reason="Triton is not installed")
 activations = pytest.importorskip("sadgs_ns.kernels.activations", reason="Triton is not installed")
@@ -275,7 +275,7 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
     generator = torch.Generator().manual_seed(degree)
     shapes = (40, 3), (40, 3), (40, num_others, 3), (3, 3), (3, 40, 3)
     *values, centres, weights = (torch.randn(shape, generator=generator) for shape in shapes)
-    viewmats, radii = scenes.cameras_at(centres), torch.randint(-1, 9, (3, 40, 2), generator=generator)
+    viewmats, radii = small_scenes.cameras_at(centres), torch.randint(-1, 9, (3, 40, 2), generator=generator)
     radii = radii if per_axis_radii else radii[..., 0].contiguous()
     drawn = (radii > 0).all(dim=-1) if per_axis_radii else radii > 0
     fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
@@ -286,7 +286,7 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
     # What is not written keeps what was in the memory before.
     monkeypatch.setattr(torch, "empty_like", lambda tensor: torch.full_like(tensor, math.nan))
     colors.backward(v_colors)
-    positions = scenes.centres_of(viewmats)
+    positions = small_scenes.centres_of(viewmats)
     torch.testing.assert_close(positions[:, 0].float(), centres, atol=1e-5, rtol=1e-5)
     slow = means, first, rest = [value.double().requires_grad_() for value in values]
     coefficients = torch.cat([first[:, None], rest], dim=1).expand(3, -1, -1, -1)
@@ -304,14 +304,16 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
 @pytest.mark.parametrize("kept", [Tensor.half, quantize], ids=["float16", "8 bits"])
 def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     n, width, height = 150, 40, 30
-    params = {name: p.detach() for name, p in scenes.random_params(n).items()}
+    params = {name: p.detach() for name, p in small_scenes.random_params(n).items()}
     params["scales"][::9] += 3  # reaches over the border
     params["means"][::13, 2] = -1  # behind the camera
-    viewmats, Ks = scenes.camera(width, height, focal=40.0)
+    viewmats, Ks = small_scenes.camera(width, height, focal=40.0)
     viewmats, Ks = viewmats.repeat(2, 1, 1), Ks.repeat(2, 1, 1)
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1)[0]
     viewmats[1, :3, 3] = torch.tensor([0.1, -0.2, 0.5])
-    _, _, info = scenes.splat({name: torch.nn.Parameter(p) for name, p in params.items()}, viewmats, Ks, width, height)
+    _, _, info = small_scenes.splat(
+        {name: torch.nn.Parameter(p) for name, p in params.items()}, viewmats, Ks, width, height
+    )
     radius = info["radii"] if info["radii"].dim() == 2 else info["radii"].amin(dim=-1)
     info["radii"] = torch.stack([radius, 2 * radius], dim=-1) if per_axis_radii else radius
     generator = torch.Generator().manual_seed(0)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from triton_compiler import run_with_the_compiler
+
+from helpers.triton_compiler import run_with_the_compiler
 
 pytest.importorskip("triton", reason="Triton is not installed")
 
@@ -108,7 +109,7 @@ for i, parameter in enumerate(_update.params):
     elif name in ("rates", "scales"):
         signature[name] = ("*fp32",) * 3
     else:
-        others = {"noted": "*fp32", "overflowed": ("*i64",), "rows": "i32"}
+        others = {"nonfinite_flag": "*fp32", "overflowed": ("*i64",), "rows": "i32"}
         others |= {"beta1": "fp32", "beta2": "fp32", "eps": "fp32"}
         signature[name] = others.get(name, "constexpr")
 constants = {"WIDTHS": (3, 45, 1), "FLAGS": 1, "MAX": 1e18, "BLOCK": 1024}
@@ -130,7 +131,7 @@ sys.path.insert(0, sys.argv[1])
 import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
-from compile_timer import CompileTimer
+from helpers.compile_timer import CompileTimer
 from sadgs_ns.kernels.trial import _write_one
 
 def compile():

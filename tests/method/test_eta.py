@@ -7,9 +7,9 @@ import math
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _world_to_cam
-from scenes import camera, random_params
 from torch import Tensor
 
+from helpers.small_scenes import camera, random_params
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.eta import (
     eta,

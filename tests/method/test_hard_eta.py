@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scenes
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -27,6 +26,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 from torch import Tensor
 
+from helpers import small_scenes
 from sadgs_ns.data.cameras import check_camera_types, check_undistortion
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.kernels import triton_switched
@@ -38,7 +38,7 @@ from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.views import TrainingViews
+from sadgs_ns.training.step.views import TrainingViews
 
 harmonics = pytest.importorskip("sadgs_ns.kernels.harmonics", reason="Triton is not installed")
 photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is not installed")
@@ -69,8 +69,8 @@ def uniform_map(value: float = 0.05, views: int = 1) -> Tensor:
 
 def forward(params: dict[str, torch.nn.Parameter], focal: float) -> dict[str, Any]:
     """Info of a forward pass before a uniform S̄."""
-    viewmats, Ks = scenes.camera(WIDTH, HEIGHT, focal=focal)
-    renders, alphas, info = scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
+    viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=focal)
+    renders, alphas, info = small_scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
     assert renders.isfinite().all() and alphas.isfinite().all()
     return {**info, "viewmats": viewmats, "Ks": Ks, "structure_tensors": uniform_map()}
 
@@ -169,8 +169,8 @@ def test_log_scales_from_minus_30_to_30(focal: float):
     assert info["conics"][visible(info)].isfinite().all()
     state = observed(params, info)
     assert state["n_total"].sum() > 10
-    viewmats, Ks = scenes.camera(WIDTH, HEIGHT, focal=focal)
-    renders, alphas, _ = scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
+    viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=focal)
+    renders, alphas, _ = small_scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
     (renders.sum() + alphas.sum()).backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in params.values())
 
@@ -188,7 +188,7 @@ def test_eta_spans_the_whole_range_of_scales():
 @pytest.mark.hard_case("depths down to 10⁻³⁰ (near plane 0)", "the Jacobian is right: it squares no depth")
 def test_axes_at_depths_whose_square_underflows():
     """fx / z is finite, z² is 0: gsplat with a near plane of 0 draws such Gaussians."""
-    viewmats, Ks = scenes.camera(WIDTH, HEIGHT, focal=50.0)
+    viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=50.0)
     axes = projected_axes(
         torch.tensor([[0.0, 0.0, 1e-30]]), torch.tensor([IDENTITY]), torch.full((1, 3), 1e-30), viewmats, Ks, 64, 48
     )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 from gsplat.strategy import ops as gsplats
-from scenes import adam, random_params
 
+from helpers.small_scenes import adam, random_params
 from sadgs_ns.method.ops import update_param_with_optimizer
 
 N = 5

@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
-from scenes import adam, camera, random_params, splat
 
+from helpers.small_scenes import adam, camera, random_params, splat
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.split import (

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from scenes import camera, random_params, splat
 
+from helpers.small_scenes import camera, random_params, splat
 from sadgs_ns.method import statistics as statistics_of_eta
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import consistent, empty_statistics

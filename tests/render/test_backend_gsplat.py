@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from gsplat_stub import stub_gsplat
-from random_scene import random_scene
 from torch import Tensor
 
+from helpers.gsplat_stub import stub_gsplat
+from helpers.rendered_scene import random_scene
 from sadgs_ns import kernels
 from sadgs_ns.method.screen_gradients import keep_gradient
 from sadgs_ns.render import backend_gsplat, backend_torch, rasterization

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from gsplat_like import splatted
-from random_scene import random_scene
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.gsplat_like import splatted
+from helpers.rendered_scene import random_scene
 from sadgs_ns.render import backend_torch
 
 NEAR = 0.01

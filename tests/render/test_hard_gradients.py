@@ -23,15 +23,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import scenes
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
-from gsplat_like import splatted
-from kill_and_resume import differences
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from runs import checkpoint, configure, train
 from torch import Tensor
 
+from helpers import small_scenes
+from helpers.gsplat_like import splatted
+from helpers.kill_and_resume import differences
+from helpers.short_runs import checkpoint, configure, train
 from sadgs_ns import kernels
 from sadgs_ns.method import losses
 
@@ -272,7 +272,9 @@ def compare_harmonics(degree: int, values: list[Tensor], viewmats: Tensor, drawn
     (colors * (weights * drawn[..., None]).to(DEVICE)).sum().backward()
     slow = means, first, rest = [value.double().requires_grad_() for value in values]
     coefficients = torch.cat([first[:, None], rest], dim=1).expand(views, -1, -1, -1)
-    expected = (_spherical_harmonics(degree, means - scenes.centres_of(viewmats), coefficients) + 0.5).clamp_min(0)
+    expected = (_spherical_harmonics(degree, means - small_scenes.centres_of(viewmats), coefficients) + 0.5).clamp_min(
+        0
+    )
     (expected * weights * drawn[..., None]).sum().backward()
     torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=1e-5, rtol=1e-5)
     gradients = []
@@ -286,7 +288,7 @@ def compare_harmonics(degree: int, values: list[Tensor], viewmats: Tensor, drawn
 
 
 def cameras(n: int) -> Tensor:
-    return scenes.cameras_at(torch.full((n, 3), 2.0))
+    return small_scenes.cameras_at(torch.full((n, 3), 2.0))
 
 
 @pytest.mark.hard_case(
@@ -298,7 +300,7 @@ def test_harmonics_near_and_far(distance: float, n: int):
     shapes = (n, 3), (n, 3), (n, 15, 3)
     means, first, rest = (2 * noise(*shape, seed=i).float() - 1 for i, shape in enumerate(shapes))
     drawn = torch.ones(2, n, dtype=torch.bool)
-    compare_harmonics(3, [distance * means, first, rest], scenes.cameras_at(torch.zeros(2, 3)), drawn)
+    compare_harmonics(3, [distance * means, first, rest], small_scenes.cameras_at(torch.zeros(2, 3)), drawn)
 
 
 @pytest.mark.hard_case("harmonics of degree 0 alone", "equals gsplat's in float64 within 2e-5")

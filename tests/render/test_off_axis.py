@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 import torch
-from gsplat_like import rasterization
-from random_scene import random_scene
 
+from helpers.gsplat_like import rasterization
+from helpers.rendered_scene import random_scene
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.rasterization import visible
 
@@ -68,7 +68,7 @@ def test_what_is_not_drawn_has_no_gradient():
     "is not drawn beyond 4 half images (`max_off_axis`)",
 )
 def test_a_giant_beside_the_view_covers_none_of_it():
-    # As on a capture of 30 photos (tests/method/test_scale_limits.py): 30 units to the side, an axis of 324 units.
+    # As on a capture of 30 photos (tests/geometry/test_scale_limits.py): 30 units to the side, an axis of 324 units.
     K = torch.tensor([[[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]]])
     for max_off_axis, covered in ((0.0, True), (4.0, False)):
         _, alphas, _ = rasterization(

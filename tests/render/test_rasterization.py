@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import torch
-from random_scene import random_scene, render_with_gradients
 
+from helpers.rendered_scene import random_scene, render_with_gradients
 from sadgs_ns.errors import InputError
 from sadgs_ns.render import rasterization
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
@@ -48,7 +48,7 @@ def test_a_backend_that_does_not_run_here_is_refused(wanted: Any, device: str, m
 def test_the_cpu_never_loads_gsplats_kernels() -> None:
     program = """
 import sys
-from random_scene import random_scene, render_with_gradients
+from helpers.rendered_scene import random_scene, render_with_gradients
 import torch
 render_with_gradients(random_scene(20, 16, 0), "cpu", torch.float32)
 loaded = {"gsplat.cuda._backend", "gsplat.csrc", "gsplat_cuda"} & set(sys.modules)

@@ -8,22 +8,22 @@ from typing import Any
 import gsplat
 import pytest
 import torch
-from gsplat_stub import stub_gsplat
-from kill_and_resume import set_up
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from runs import ITERATIONS, configure, is_finite, train
 
+from helpers.gsplat_stub import stub_gsplat
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import ITERATIONS, configure, is_finite, train
 from sadgs_ns.cli import export
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import RADII_PER_AXIS
 from sadgs_ns.render import rasterization
-from sadgs_ns.training import compilation
 from sadgs_ns.training import config as config_module
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.stages import Stages
-from sadgs_ns.training.trainer import SadgsTrainer
+from sadgs_ns.training.kernels_ahead import compilation
+from sadgs_ns.training.kernels_ahead.probes import Stages
+from sadgs_ns.training.run.trainer import SadgsTrainer
 
 ON_GPU = torch.cuda.is_available()
 

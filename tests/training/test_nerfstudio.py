@@ -10,10 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import processes
 import pytest
 import torch
-from kill_and_resume import differences, set_up
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -21,7 +19,11 @@ from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.train import entrypoint
 from nerfstudio.utils.eval_utils import eval_setup
 from plyfile import PlyData
-from runs import (
+
+from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers import forked_python
+from helpers.kill_and_resume import differences, set_up
+from helpers.short_runs import (
     ITERATIONS,
     SCHEDULE,
     TRAIN_VIEWS,
@@ -32,22 +34,20 @@ from runs import (
     nerfstudio_data,
     train,
 )
-from scenes import HEIGHT, POINTS, VIEWS, WIDTH
-
-from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.small_scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from sadgs_ns.errors import InputError
-from sadgs_ns.method.near_plane import NEAR_SHARE
+from sadgs_ns.geometry.near_plane import NEAR_SHARE
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel, load_lpips
-from sadgs_ns.training.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.presets import RATES
-from sadgs_ns.training.train_step import training_step
-from sadgs_ns.training.trainer import SadgsTrainer
-from sadgs_ns.training.views import ViewSampler
+from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
+from sadgs_ns.training.step.train_step import training_step
+from sadgs_ns.training.step.views import ViewSampler
 
 
 @pytest.fixture(scope="module")
@@ -370,7 +370,7 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(
         assert 0 < photometric < 2 and opacity_reg in (0, 100)
         return result
 
-    monkeypatch.setattr("sadgs_ns.training.trainer.training_step", look)
+    monkeypatch.setattr("sadgs_ns.training.run.trainer.training_step", look)
     set_up(config).train()
     assert regularized == [True] * 4 + [False] * 4
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
@@ -439,7 +439,7 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
     monkeypatch.setattr(adam, "adam_step", counted)
     before = {name: parameter.detach().clone() for name, parameter in trainer.pipeline.model.gauss_params.items()}
     monkeypatch.setattr(
-        "sadgs_ns.training.optimizers.use_triton", lambda place: True
+        "sadgs_ns.training.step.optimizers.use_triton", lambda place: True
     )  # in its interpreter, without CUDA
     trainer.train()
     assert launched == [6] * 3
@@ -503,14 +503,14 @@ def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataPa
     code = f"""
 import os, signal, torch
 from pathlib import Path
-from sadgs_ns.training import checkpoints
+from sadgs_ns.training.run import checkpoints
 def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
 torch.save = killed
 checkpoints.write(Path({str(trainer.checkpoint_dir)!r}), 2, {{}}, keep=False)
 """
-    assert processes.python(code).returncode == -9
+    assert forked_python.python(code).returncode == -9
     assert len(list(tmp_path.rglob("*.partial"))) == 1
     config.load_dir = trainer.checkpoint_dir
     resumed = set_up(config)
@@ -558,7 +558,9 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
         pipeline.follow(dataclasses.replace(pipeline.model.plan, views_per_iteration=len(indices)))
         pipeline.views.sampler.requeue(indices)
         update = AdamUpdate({"means": FusedAdam([model.means], lr=0.0)})
-        return training_step(model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.slot).loss
+        return training_step(
+            model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.nonfinite_flag
+        ).loss
 
     alone = [loss(index) for index in range(5)]
     assert len({round(float(value), 4) for value in alone}) == 5
@@ -671,7 +673,7 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
     _, pipeline, _, _ = eval_setup(finished / "config.yml")
     model: Any = pipeline.model
     assert isinstance(model, SadgsModel) and model.config.near_plane is None
-    assert model.near_plane == stored
+    assert model.plan.near_plane == stored
     datamanager: Any = pipeline.datamanager
     cameras = datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
@@ -694,9 +696,9 @@ def test_a_plane_that_is_given_is_kept_also_where_the_checkpoint_has_another(
 ):
     config = configure(tmp_path, colmap, ITERATIONS)
     config.pipeline.model.near_plane = 0.123
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.load_dir = finished / "nerfstudio_models"
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.pipeline.model.near_plane = 0.0
     with pytest.raises(InputError, match=r"^pipeline\.model\.near_plane must be positive and finite, got 0\.$"):
         set_up(config)

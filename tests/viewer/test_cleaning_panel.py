@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import torch
-from kill_and_resume import set_up
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
-from runs import in_the_viewer
 
-from sadgs_ns.method.cleaning import Cleaning, find_remaining, measure_visibility
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import in_the_viewer
+from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.viewer.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options

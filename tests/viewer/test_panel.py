@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from kill_and_resume import set_up
 
+from helpers.kill_and_resume import set_up
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
@@ -110,7 +110,7 @@ def test_what_goes_wrong_is_told_in_the_panel_too(
     def full(*_: Any) -> None:
         raise RuntimeError("CUDA out of memory.\nOf no interest.")
 
-    monkeypatch.setattr(panel_module, "observe_training_views", full)
+    monkeypatch.setattr(pipeline.model, "render", full)
     panel = pipeline.structure
     panel.observe.cb_hook(panel.observe)
     assert told(panel)[-1] == "The viewer's panel stays as it was: CUDA out of memory"

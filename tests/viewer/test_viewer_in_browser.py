@@ -11,15 +11,15 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-import browser
 import pytest
-from browser import Page, open_page
-from kill_and_resume import configure, set_up
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer import Viewer
-from processes import HANGS
 
 from examples.drawn_scene.scene import write_scene
+from helpers import browser
+from helpers.browser import Page, open_page
+from helpers.forked_python import HANGS
+from helpers.kill_and_resume import configure, set_up
 from sadgs_ns.viewer.structure_panel import OUTPUT
 
 LABEL = "[...document.querySelectorAll('label')].filter(l => l.textContent == '{}')[0]"
@@ -82,7 +82,7 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
             page.run(f"{ELEMENT.format('max_gaussians')}.select()")
             page.type("4567")
             page.press("Enter", 13)
-            eventually(lambda: pipeline.model.strategy.max_gaussians == 4567)
+            eventually(lambda: pipeline.model.plan.strategy.max_gaussians == 4567)
             page.wait_for("document.body.innerText.includes('cap 4,567')")
             select(page, "Preview", "what stays")
             number = pipeline.model.num_points

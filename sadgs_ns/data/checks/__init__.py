@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
+from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
-from sadgs_ns.data.checks.layouts import ParserOptions, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions, automatic_options, layout_of
 
 
 @collect_findings

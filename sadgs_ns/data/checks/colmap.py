@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data import colmap
-from sadgs_ns.data.checks import images, layouts
+from sadgs_ns.data import colmap, images, layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
-from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
-from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.checks.geometry import check_points, check_views
+from sadgs_ns.data.checks.images import check_images
+from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
+from sadgs_ns.data.layouts import ParserOptions, automatic_options
 from sadgs_ns.data.text import read_text
+from sadgs_ns.data.views import Camera, View, check_positive
 from sadgs_ns.errors import InputError
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's camera models that nerfstudio cannot read
@@ -31,7 +33,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     folder, model_folder = data / options.images_path, data / options.colmap_path
     if (kind := colmap.model_kind(model_folder)) is None:
         if not (models := layouts.find_reconstructions(data)):
-            raise InputError(layouts.no_layout(data))
+            raise InputError(no_layout(data))
         found = automatic_options(data)
         problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
         raise InputError(f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`.")
@@ -53,7 +55,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
             size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
             mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
             frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
-        yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
+        yield from check_images(frames, poses_path, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
@@ -139,23 +141,6 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
         raise InputError(f"{problem}: {remedy}.")
     yield warning(f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}.")
     return 1
-
-
-def automatic_options(data: Path) -> ParserOptions:
-    """Return how a folder's reconstruction, which it must have, is read where no parser is named.
-
-    Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
-    that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
-    """
-    model, names = next(iter(layouts.find_reconstructions(data).items()))
-    folder = layouts.images_folder(data, model, names) or Path("images")
-    options = ParserOptions(images_path=folder, colmap_path=model, downscale_factor=1, eval_mode="interval")
-    if not names or folder == Path():  # The smaller copies of images right in the capture would lie outside of it.
-        return options
-    image, copies = data / folder / names[0], lambda by: images.smaller_folder(data / folder, by) / names[0]
-    factor = images.automatic_factor(image, copies)
-    rounding = images.rounding_of(image, copies(factor), factor)
-    return dataclasses.replace(options, downscale_factor=factor, downscale_rounding_mode=rounding)
 
 
 def _camera(camera: colmap.Camera, where: str) -> Camera:

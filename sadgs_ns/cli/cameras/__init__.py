@@ -1,1 +1,0 @@
-"""`sadgs-process`: from photos or a video to a scene for training."""

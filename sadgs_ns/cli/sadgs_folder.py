@@ -1,0 +1,152 @@
+"""The folder of `sadgs`: the settings that it was begun with, how far the work is, and where its parts lie."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+from sadgs_ns.cli.given_cameras import GivenCameras
+from sadgs_ns.errors import InputError
+from sadgs_ns.files import read_settings, write_json
+
+_OPTION_NAMES = {
+    "source": "source",
+    "cameras": "--cameras",
+    "max_size": "--max-size",
+    "effort": "--effort",
+    "train_options": "options of ns-train",
+}
+"""Names of the settings that options decide, in sentences and as keys of settings.json; other keys are fields."""
+
+
+@dataclass
+class Settings:
+    """What is noted in settings.json, which lacks what is None."""
+
+    # What the options of the command decide
+    source: str | None = None  # Path without links
+    cameras: str | None = None  # "new", or the description of given cameras
+    max_size: int | None = None
+    effort: float | None = None
+    train_options: list[str] | None = None
+
+    # How far the work is
+    run: str = "run"  # The name of the present run's folder
+    views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
+    files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
+    trained: str | None = None  # The sentence of a finished training
+    few: str | None = None  # The sentence on the registered photos, if they are fewer than half of all
+
+    @classmethod
+    def read(cls, file: Path, folder: Path) -> Settings | None:
+        """Read the settings of a folder, None if it has none; raise InputError if they are damaged."""
+        stored = read_settings(file, folder)
+        if not stored:
+            return None
+        values = {}
+        for name in (each.name for each in fields(cls)):
+            value = stored.get(_OPTION_NAMES.get(name, name))
+            if value is not None:
+                values[name] = value
+        return cls(**values)
+
+    def write(self, file: Path) -> None:
+        """Write the settings, so that they are complete or as they were before."""
+        write_json(
+            file, {_OPTION_NAMES.get(name, name): value for name, value in vars(self).items() if value is not None}
+        )
+
+
+class SadgsFolder:
+    """The folder of all results, and its settings.
+
+    Attributes:
+        path: The folder.
+        scene: The folder of new cameras.
+        runs: The folder of the runs.
+        settings: What settings.json holds, or will hold when the work begins.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.scene = path / "scene"
+        self.runs = path / "training" / "sadgs"
+        self.settings = Settings()
+        self._file = path / "settings.json"
+
+    @property
+    def run(self) -> Path:
+        """The folder of the present run."""
+        return self.runs / self.settings.run
+
+    def read_settings(self, chosen: Settings, given: GivenCameras | None) -> None:
+        """Read the settings that the folder was begun with, and replace those that nothing depends on yet.
+
+        Raise InputError if the others differ from those that the options have `chosen`, if images of given cameras
+        changed since training began, or if the folder is something else.
+        """
+        begun = Settings.read(self._file, self.path)
+        if begun is None:
+            if self.path.is_file() or (self.path.is_dir() and any(self.path.iterdir())):
+                raise InputError(f"{self.path} exists and is not a folder that sadgs began; give another --output.")
+            self.settings = chosen
+            return
+        self.settings = begun
+        differences = self._differences(chosen)
+        if given is not None and self.checkpoint():
+            differences += given.changed_images(begun.files)
+        if differences:
+            problem = f"{self.path} was begun with other settings ({'; '.join(differences)})"
+            raise InputError(f"{problem}; give another --output or delete it.")
+        self.settings = replace(begun, **{name: getattr(chosen, name) for name in _OPTION_NAMES})
+
+    def _differences(self, chosen: Settings) -> list[str]:
+        """Return the settings that differ and that something was made with, as parts of a sentence."""
+        decided = ["source", "cameras"]
+        if self.has_scene():
+            decided.append("max_size")
+        if self.checkpoint():
+            decided += ["effort", "train_options"]
+        differences = []
+        for name in decided:
+            before = getattr(self.settings, name)
+            now = getattr(chosen, name)
+            if before != now:
+                differences.append(f"{_OPTION_NAMES[name]} was {_shown(before)}, is {_shown(now)}")
+        return differences
+
+    def write_settings(self) -> None:
+        """Write settings.json."""
+        self.settings.write(self._file)
+
+    def has_scene(self) -> bool:
+        """Return whether new cameras were found."""
+        return (self.scene / "transforms.json").exists()
+
+    def views(self) -> list[str]:
+        """Return the scene's images in the order in which nerfstudio divides them."""
+        described = json.loads((self.scene / "transforms.json").read_bytes())
+        return sorted((frame["file_path"] for frame in described["frames"]), key=Path)
+
+    def checkpoint(self) -> Path | None:
+        """Return the last checkpoint of the present run."""
+        return max(self.run.glob("nerfstudio_models/step-*.ckpt"), default=None)
+
+    def trained(self) -> str | None:
+        """Return the sentence of a finished training, None if there is none or its checkpoint was deleted."""
+        if self.checkpoint() is None:
+            return None
+        return self.settings.trained
+
+    def splat(self, format_name: str) -> Path:
+        """Return the file of the splat in a format."""
+        return self.path / f"splat.{format_name}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return shlex.join(value) or "none"
+    return str(value)

@@ -1,0 +1,1 @@
+"""What is decided from a capture's geometry: near plane, camera paths, limits on scales, stereo depth, outliers."""

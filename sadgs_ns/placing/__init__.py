@@ -1,0 +1,1 @@
+"""From photos to the poses of their cameras, with pycolmap."""

@@ -1,0 +1,211 @@
+"""Finds the photos or videos of a folder, and masks, and tells of other images."""
+
+from __future__ import annotations
+
+import contextlib
+import filecmp
+import math
+import os
+import re
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image, ImageOps
+
+from sadgs_ns.data.images import IMAGE_SUFFIXES, image_size
+from sadgs_ns.data.layouts import automatic_options
+from sadgs_ns.data.transforms import frames_of, mended_name, read_json
+from sadgs_ns.errors import InputError
+from sadgs_ns.files import read_settings
+
+COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
+_FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
+_VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+_NOT_READ = "images that are not read (make them .jpg or .png files)"
+_RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+"""Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
+_SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
+"""Files in folders of network drives and operating systems for thumbnails and deleted files."""
+_MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
+_MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
+_VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small)$")
+"""Additions to a photo's name for its mask or a copy (IMG_E1 is the edited IMG_1), not the (1), (2) of Windows."""
+
+
+def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str], list[str]]:
+    """Return the photos of a folder for a scene, or its videos if it has fewer than three photos.
+
+    The result is their names (none for a single video), whether they are videos, and masks and sentences as of
+    `look_into`. Raise InputError if there are neither three photos nor a video, or a name is no Unicode.
+    """
+    if source.is_file():
+        return [], True, {}, []
+    if not source.is_dir():
+        raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
+    photos, masks, others = look_into(source, out)
+    if len(photos) < 3:
+        if videos := find_videos(source):
+            unused = [f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3."] if photos else []
+            return videos, True, {}, [*unused, *others]
+        told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise InputError(" ".join([told, *others]))
+    for name in photos:
+        if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.
+            raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
+    return photos, False, masks, others
+
+
+def find_videos(folder: Path) -> list[str]:
+    """Return the names of a folder's videos, relative to it, in order."""
+    return [name for name in _visible_files(folder) if Path(name).suffix.lower() in _VIDEOS]
+
+
+def _visible_files(folder: Path) -> list[str]:
+    """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them.
+
+    Folders that cannot be read are among them. Links to folders are followed, unless they lead to what is read anyway.
+    """
+    paths, unread = list[Path](), list[OSError]()
+    seen = {top := Path(os.path.realpath(folder)), *top.parents}
+    for parent, folders, files in os.walk(folder, onerror=unread.append, followlinks=True):
+        paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
+        real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
+        inner = {name for name in folders if Path(parent, name).is_symlink() and top in real[name].parents}
+        folders[:] = [name for name in folders if real[name] not in seen and name not in inner]
+        seen |= {real[name] for name in folders}
+    paths += (Path(error.filename) for error in unread)
+    names = (path.relative_to(folder).as_posix() for path in sorted(paths))
+    return [name for name in names if "/." not in f"/{name}"]
+
+
+def images_of(cameras: Path, folder: Path) -> list[str]:
+    """Return the images and masks of a capture that brings its cameras, relative to its folder.
+
+    They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, in
+    `masks` and where the model's images are: renderings of a run may lie in other folders.
+    """
+    names, keys = list[str](), ("file_path", "mask_path")
+    if cameras.suffix == ".json":
+        with contextlib.suppress(InputError):  # Training tells what is wrong with the file, if it reads that one.
+            frames = frames_of(read_json(cameras), cameras)
+            names = [mended_name(folder, frame[key]) for frame in frames for key in keys if key in frame]
+    else:
+        images = [name for name in _visible_files(folder) if Path(name).suffix.lower() in IMAGE_SUFFIXES]
+        tops = ("", "masks", *automatic_options(folder).images_path.parts[:1])
+        names = [name for name in images if name.rpartition("/")[0].partition("/")[0] in tops]
+    return [name for name in dict.fromkeys(names) if (folder / name).is_file()]
+
+
+def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[str]]:
+    """Return the photos of a folder for a scene, their masks by photo, and sentences on the other images that it has.
+
+    Names are relative to the folder. The scene's own photos stay photos. Hidden files and scenes' files are left out.
+    """
+    with contextlib.suppress(ImportError):  # In an older environment HEIC is left out.
+        import pi_heif
+
+        pi_heif.register_heif_opener()  # Pillow then reads HEIC, but not where poses are given: training would not.
+    folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
+    files = _visible_files(folder)
+    settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
+    scenes = {scene, *(path.parents[1] for path in settings)}
+    known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
+    found, stems, masks = defaultdict(list), defaultdict(list), {}
+    for name in files:
+        if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
+            if kind == "photos" and name not in known:
+                others = {"thumbnails or trash": _SERVICE, "depth or other maps": _MAP, "masks": _MASK}
+                kind = next((other for other, names in others.items() if names.fullmatch(name)), kind)
+            found[kind].append(name)
+    maps = [name for name in found["masks"] if _is_mask(folder / name)]
+    photos = sorted({*found["photos"], *found["masks"]} - {*maps})
+    found["copies of others"] = copies = _copies(folder, photos, known)
+    found["panoramas of a part of the view"] = swept = [p for p in photos if p not in known and _is_swept(folder / p)]
+    photos = [name for name in photos if name not in {*copies, *swept}]
+    for name in photos:
+        stems[_stem(name)].append(name)
+    for name in maps:
+        parts = {*name.split("/")}
+        if stems[_stem(name)]:
+            masks.setdefault(max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")})), name)
+        else:
+            found["masks of no photo"].append(name)
+    left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
+    return photos, masks, [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
+
+
+def _kind(path: Path) -> str:
+    """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
+    suffix, kind, start = path.suffix.lower(), "", b""
+    if path.is_dir():
+        return "folders that cannot be read"
+    with contextlib.suppress(OSError), path.open("rb") as file:  # What cannot be read is named later.
+        start = file.read(12)
+    if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
+        return "photos"
+    with contextlib.suppress(Exception), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
+        kind = image.format
+    if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
+        return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
+    return "photos" if kind in _FORMATS - {"TIFF"} else _NOT_READ
+
+
+def _stem(name: str) -> str:
+    """Return the part of a photo's name that its mask and copies share."""
+    stem = Path(_VARIANT.sub("", Path(name).stem.lower()))
+    return stem.stem if stem.suffix in IMAGE_SUFFIXES | _RAW_OR_HEIC else stem.name
+
+
+def _is_mask(path: Path) -> bool:
+    """Return whether an image has two colours at most, or nearly all of it is black or white."""
+    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged image is named when it is read.
+        pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)).reshape(-1, 3)
+        is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
+        return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
+    return False
+
+
+def _is_swept(path: Path) -> bool:
+    """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
+    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
+        is_whole, lens = image.width == 2 * image.height, Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
+        by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
+        return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
+    return False
+
+
+def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
+    """Return the photos with the bytes of another, or with its name and about its content."""
+    groups, copies = defaultdict(list), []
+    for name in sorted(photos, key=len):
+        if (folder / name).is_file() and (size := (folder / name).stat().st_size):
+            groups[size].append(name)
+            groups[_stem(name)].append(name)
+    for names in (names for names in groups.values() if len(names) > 1):
+        pixels = {name: math.prod(image_size(folder / name)) for name in names}
+        names.sort(key=lambda name: (name not in known, -pixels[name]))
+        for i, name in enumerate(names):
+            if name not in {*known, *copies} and any(_is_copy(folder / name, folder / other) for other in names[:i]):
+                copies.append(name)
+    return copies
+
+
+def _is_copy(photo: Path, other: Path) -> bool:
+    """Return whether photos are equal, or have one name and differ in size, format or tone alone."""
+    if filecmp.cmp(photo, other, shallow=False):
+        return True
+    # A damaged photo is named when it is read.
+    with contextlib.suppress(Exception), Image.open(photo) as one, Image.open(other) as two:
+        is_rig = one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix
+        if is_rig or _stem(photo.name) != _stem(other.name):
+            return False
+        one.draft("L", (64, 64))
+        two.draft("L", (64, 64))
+        a, b = (ImageOps.exif_transpose(image).convert("L") for image in (one, two))
+        small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (a, b)]
+        with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
+            is_alike = np.corrcoef(small)[0, 1] > 0.99  # Smaller copies of photos reach .999.
+        return bool(is_alike and 0.97 < a.width * b.height / (a.height * b.width) < 1.03)
+    return False

@@ -1,0 +1,335 @@
+"""The stages from photos to a scene: features, matches, cameras with points, and undistortion, all by pycolmap.
+
+Each stage goes on where an interrupted run left it. Only the process of `colmap_process.py` may import this module.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import itertools
+import json
+import shutil
+from collections.abc import Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pycolmap
+
+from sadgs_ns.errors import InputError
+from sadgs_ns.events import progress
+from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
+from sadgs_ns.placing.panoramas import rotations
+from sadgs_ns.placing.photos import empty_folder, in_order
+from sadgs_ns.placing.plan import Matching, Summary
+
+if TYPE_CHECKING:
+    import torch
+
+_SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
+_TRIALS = 2000
+"""Random samples after which COLMAP gives up on a pair of photos. Its own 10,000 take three times as long, for pairs
+with hardly anything in common, and find no more matches in the others."""
+_PAIRS = 50  # Pairs of photos that COLMAP matches, saves and reports at a time; it starts its threads for each batch
+_ADJUSTMENT = {
+    "ba_global_frames_ratio": 3.0, "ba_global_points_ratio": 3.0,
+    "ba_local_function_tolerance": 1e-4, "ba_global_function_tolerance": 1e-5,
+    "ba_local_max_refinements": 1, "ba_global_max_refinements": 2,
+}  # fmt: skip
+"""Growth of a model until all of it is adjusted again, the relative change of the cost at which an adjustment ends, and
+how often it is repeated on other points. COLMAP's own are 1.1, 0, 2 and 5."""
+_PLACING = {"ba_local_num_images": 2, "init_min_tri_angle": 8.0}
+"""Photos that are adjusted after each that is placed, and the least angle in degrees between the first two. COLMAP's
+own are 6 and 16; of 200 frames of a room it looked 10 s for two with 16 and then took two with 8."""
+_RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
+"""Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
+_ENOUGH, _MOST_STRETCH = 0.9, 0.05
+"""Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
+of lenses differ less, those of models that went wrong in the beginning more."""
+FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
+
+
+def make_model(
+    photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None,
+    rigs: Sequence[Sequence[str]],
+) -> Summary:  # fmt: skip
+    """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
+
+    Raise InputError if no two photos could be related, or none could be added.
+
+    Args:
+        photos: The folder of the photos.
+        groups: The photos' names, those of one camera together.
+        matching: Any but "auto".
+        max_size: Longest side of the undistorted photos in px; 0 keeps them as they are.
+        model: The model's folder. Beside it lie `write_alpha`'s and `write_masks`' files, and what a stopped run left.
+        base: An earlier model's folder, to which photos are added; these alone are undistorted, and its cameras stay.
+        rigs: The names of the views of each panorama.
+    """
+    pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
+    names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
+    gpu, nerfstudio = begin_imports()
+    if not model.exists():
+        extract(photos, groups, database, rigs)
+        match(names, database, matching, gpu.result(), rigs)
+        place_cameras(photos, names, database, model, base)
+    known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
+    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+    undistort(photos, model, made, max_size, known)
+    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
+        nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
+    if rigs:
+        hold_out_panoramas(undistorted / "transforms.json", rigs)
+    return summarize(names, made, database, matching, (model / "attempts.txt").read_text())
+
+
+@cache
+def begin_imports() -> tuple[Future[torch.device | None], Future[ModuleType]]:
+    """Begin to import torch and nerfstudio's writer of scenes in a thread, because that takes seconds."""
+    pool = ThreadPoolExecutor(1)
+    return pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
+
+
+def wake_gpu() -> torch.device | None:
+    """Import torch, and return the CUDA device if there is one, ready to compute."""
+    import torch
+
+    import_module("sadgs_ns.placing.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
+    if not torch.cuda.is_available():
+        return None
+    device = torch.device("cuda")
+    torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first operations on a device start it.
+    return device
+
+
+def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
+    """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
+    described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
+    names = in_order([frame["file_path"] for frame in described["frames"]])
+    whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
+    chosen = list(dict.fromkeys(whole.values()))[4::10]
+    if held_out := [name for name in names if whole[name] in chosen]:
+        described["train_filenames"] = [name for name in names if whole[name] not in chosen]
+        described |= {"val_filenames": held_out, "test_filenames": held_out}
+        file.write_text(json.dumps(described, indent=4))
+
+
+def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> list[tuple[str, str]]:
+    """Pair all photos, or with "sequential" each with some that follow it.
+
+    The views of a panorama, which have one centre, are not paired with each other. With "sequential" only those views
+    of two panoramas are paired that look the same way, and fewer follow, because a panorama overlaps with many.
+    """
+    in_turn, units = matching == "sequential", {views[0]: views for views in rigs}
+    first, axes = {view: views[0] for views in rigs for view in views}, rotations()[:, :, 2]
+    order = list(dict.fromkeys(first.get(name, name) for name in (in_order(names) if in_turn else names)))
+    pairs: list[tuple[str, str]] = []
+    for a, b in sequential_pairs(order, 2 if rigs else 10) if in_turn else itertools.combinations(order, 2):
+        views = itertools.product(units.get(a, [a]), units.get(b, [b]))
+        both = in_turn and a in units and b in units
+        pairs += itertools.compress(views, (axes @ axes.T > 0.4).flat) if both else views
+    return pairs
+
+
+def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
+    """Pair each frame with the next `overlap` ones, and with ever fewer of the later ones, which close loops."""
+    steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
+    return [(names[i], names[i + step]) for i in range(len(names)) for step in steps if i + step < len(names)]
+
+
+def match(
+    names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None,
+    rigs: Sequence[Sequence[str]] = (),
+) -> None:  # fmt: skip
+    """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
+
+    A GPU compares the features and COLMAP verifies the matches; without one COLMAP does both, by lists in `pairs.txt`.
+    """
+    from sadgs_ns.placing.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
+
+    stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = _SEED
+    verification.ransac.max_num_trials = _TRIALS
+    progress(stage, 0, 1)
+    if matching == "similar":
+        panorama = {view: views[0] for views in rigs for view in views}
+        pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
+    else:
+        pairs = choose_pairs(names, rigs, matching)
+    if gpu is not None:
+        write_matches(database, pairs, gpu, stage)
+        # It verifies pairs that failed again each time, so all are verified in one call.
+        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+    else:
+        rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
+        for start in range(0, len(pairs), _PAIRS):
+            progress(stage, start, len(pairs))
+            listed = ((a.translate(LISTED), b.translate(LISTED)) for a, b in pairs[start : start + _PAIRS])
+            pair_list.write_text("".join(f"{a} {b}\n" for a, b in listed), "utf8")
+            pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
+            pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+        rename_images(database, UNLISTED)
+    progress(stage, len(pairs), len(pairs))
+
+
+def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
+    """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
+
+    Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
+    new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
+    """
+    before = None if base is None else pycolmap.Reconstruction(base)
+    with pycolmap.Database.open(database) as opened:
+        total, rigs = opened.num_frames(), [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
+    fixed = {sensor.id for rig in rigs for sensor in rig.sensor_ids()}  # Panoramas are cut for these cameras.
+    others: dict[str, Any] = {"min_model_size": 3}
+    if before is not None:
+        others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
+        fixed |= set(before.cameras)
+    others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
+    skips_points = not fixed  # Those that hold no photo wait for the last adjustment, which can hold nothing fixed.
+
+    def attempt(stage: str, limits: dict[str, float]) -> pycolmap.Reconstruction | None:
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **others)
+        options.mapper.mergedict({**_PLACING, "ba_global_ignore_redundant_points3D": skips_points, **limits})
+        registered = 0 if before is None else before.num_reg_frames()
+
+        def advance(more: int) -> None:
+            nonlocal registered
+            registered = min(registered + more, total)  # COLMAP goes on counting when it begins another model.
+            progress(stage, registered, total)
+
+        advance(0)
+        models = pycolmap.incremental_mapping(
+            database, photos, empty_folder(model.with_name("models")), options, input_path=base or "",
+            initial_image_pair_callback=lambda: advance(2), next_image_callback=lambda: advance(1),
+        )  # fmt: skip
+        largest = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+        if skips_points and largest is not None:
+            pycolmap.bundle_adjustment(largest, options.get_global_bundle_adjustment())
+        return largest
+
+    def quality(candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
+        """Whether an attempt suffices, and how many photos it registered."""
+        if candidate is None:
+            return False, 0
+        cameras, count = [image.camera for image in candidate.images.values()], candidate.num_reg_images()
+        stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
+        return bool(count >= _ENOUGH * len(names) and abs(stretch) < _MOST_STRETCH), count
+
+    best, note = attempt("cameras", {}), ""
+    if not quality(best)[0]:
+        second = attempt("cameras (relaxed)", _RELAXED)
+        note = f"A first attempt registered {quality(best)[1]}, one with relaxed limits {quality(second)[1]}."
+        best = max(best, second, key=quality)
+    if before is None and best is None:
+        with pycolmap.Database.open(database) as opened:
+            images = opened.read_all_images()
+            poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
+        raise InputError(
+            f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
+            "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
+        )
+    if best is None or (before is not None and best.num_reg_images() <= before.num_reg_images()):
+        raise InputError(
+            "none of the photos that were added could be related to the others: take some that share two thirds of "
+            "what they show with each other and with those that are there, or take these out of the folder again."
+        )
+    for frame_id, frame in before.frames.items() if before else ():  # COLMAP rounds poses that it holds fixed.
+        if frame.has_pose:
+            best.frames[frame_id].rig_from_world = frame.rig_from_world
+    best.extract_colors_for_all_images(photos)  # Otherwise a point has one photo's colour, or none.
+    partial = empty_folder(model.with_name("model.partial"))
+    best.write(partial)
+    check_written(partial, best)
+    (partial / "attempts.txt").write_text(note)
+    partial.rename(model)
+    progress("cameras", total, total)
+
+
+def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
+    """Return the names of the photos with a pose in a model."""
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Raise OSError if the files of a written model are smaller than it; COLMAP does not say that a disk is full.
+
+    COLMAP must not read them: it takes any bytes of a file that is cut off for a length, and asks for as much memory.
+    """
+    images = (image for image in model.images.values() if image.has_pose)
+    expected = {  # COLMAP's binary formats
+        "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
+        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in model.points3D.values()),
+    }
+    if any((folder / name).stat().st_size < size for name, size in expected.items()):
+        raise OSError(f"{folder} was not written completely: the disk is full")
+
+
+def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
+    """Write `images`, `alpha`, `masks` and their model, `sparse/0`, to the folder `undistorted`, which is made anew.
+
+    `made` is what `model` holds; `known` photos were undistorted before. Raise OSError if the model cannot be written.
+    """
+    folder = model.with_name("undistorted")
+    registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
+    progress("undistorted photos", 0, len(registered))
+    shutil.rmtree(folder, ignore_errors=True)
+    options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
+    with ThreadPoolExecutor(1) as pool:
+        undistortion = pool.submit(
+            pycolmap.undistort_images, folder, model, photos, image_names=[image.name for image in registered],
+            undistort_options=options, jpeg_quality=95,
+        )  # fmt: skip
+        while not undistortion.done():
+            wait([undistortion], timeout=0.5)
+            written = sum(path.is_file() for path in (folder / "images").rglob("*"))
+            progress("undistorted photos", written, len(registered))
+        undistortion.result()
+    for kind, image in itertools.product(("alpha", "masks"), registered):
+        if (stored := model.with_name(kind) / f"{image.name}.png").exists():
+            target = folder / kind / f"{image.name}.png"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            grey = pycolmap.Bitmap.read(stored, as_rgb=False)
+            assert grey is not None  # `write_alpha` or `write_masks` wrote it
+            grey = pycolmap.undistort_image(options, grey, image.camera)[0]
+            if kind == "masks":
+                grey = pycolmap.Bitmap.from_array(np.uint8(255 * (grey.to_array() > 127)))
+            grey.write(target)
+    sparse = folder / "sparse"
+    (sparse / "0").mkdir()
+    for file in sparse.glob("*.bin"):
+        file.rename(sparse / "0" / file.name)
+    check_written(sparse / "0", made)
+    progress("undistorted photos", len(registered), len(registered))
+
+
+def summarize(
+    names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
+) -> Summary:
+    """Count the registered photos, and find out why the others are none."""
+    registered, left_out = registered_photos(model), {}
+    with pycolmap.Database.open(database) as opened:
+        identities = {image.name: image.image_id for image in opened.read_all_images()}
+        pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
+        matches = dict.fromkeys(identities.values(), 0)
+        for pair, count in zip(pair_ids, inliers, strict=True):
+            for identity in pycolmap.pair_id_to_image_pair(pair):
+                matches[identity] = max(matches[identity], count)
+        for name in set(names) - registered:
+            if (identity := identities.get(name)) is None:
+                left_out[name] = "could not be read"
+            elif (count := opened.num_keypoints_for_image(identity)) < FEW_FEATURES:
+                left_out[name] = f"only {count} features: blurred, dark or without texture"
+            elif matches[identity] < 30:
+                left_out[name] = "matches no other photo: too little overlap"
+            else:
+                left_out[name] = "matches other photos, but its pose stayed ambiguous"
+    error = model.compute_mean_reprojection_error()
+    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts)

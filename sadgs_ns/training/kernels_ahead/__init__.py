@@ -1,0 +1,1 @@
+"""Compile the kernels of a run before its first step."""

@@ -1,0 +1,79 @@
+"""Compiles what a run needs of Triton's kernels before training starts."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from sadgs_ns.errors import reason
+from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.training.kernels_ahead import compile_ahead
+from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run.progress import note, warn
+
+_PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting for
+
+
+def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:
+    """Return what decides which kernels a run needs."""
+    model = pipeline.model
+    sizes = pipeline.datamanager.train_dataset.cameras
+    alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
+    for name, optimizer in optimizers.items():
+        value = model.trained_params.get(name)
+        if value is not None and value.numel():
+            key = name in model.gauss_params, optimizer.defaults["betas"], optimizer.defaults["eps"]
+            alike.setdefault(key, []).append(tuple(value.shape[1:]))
+    return KernelChoice(
+        device=pipeline.device,
+        views=model.plan.views_per_iteration,
+        sh_degree=model.config.sh_degree,
+        is_black=model.config.background_color == "black",
+        has_color_matrices=model.color_matrices is not None,
+        alone=model.world.alone,
+        size=(int(sizes.width.max()), int(sizes.height.max())),
+        # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
+        drawing=replace(model.drawing, near_plane=NEAR_PLANE, backend=model.backend),
+        updates=tuple(map(tuple, alike.values())),
+        structure_tensor=pipeline.structure_cache.of_images,
+    )
+
+
+def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+    """Launch the kernels of training once, on a few Gaussians, after those of `compile_ahead` are compiled.
+
+    Triton keeps kernels on the disk, so only a machine's first run takes seconds here. The run's state, random numbers
+    included, does not change. If kernels fail, a warning names them, and the run goes on: it may never need them.
+    """
+    if not use_triton(pipeline.device):
+        return
+    failures: dict[str, Exception] = {}
+
+    def launch(some: Mapping[str, Callable[[], None]]) -> bool:
+        for name, stage in some.items():
+            try:
+                stage()
+            except Exception as error:
+                failures[name] = error
+        return not some.keys() & failures.keys()
+
+    patience = threading.Timer(_PATIENCE, note, ["Compiling kernels for this GPU, once …"])
+    patience.start()
+    try:
+        compile_ahead.wait()
+        stages = Stages(choose_kernels(pipeline, optimizers))
+        launch(stages.alone())
+        if launch({"rasterization": stages.project}):
+            launch(stages.after_projection())
+    finally:
+        patience.cancel()
+    if failures:
+        why = reason(next(iter(failures.values())))
+        told = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why})"
+        warn(f"{told}: training tries them again, and stops with an error of its own if it cannot do without them.")

@@ -1,0 +1,151 @@
+"""Compile the kernels of the method's defaults from the first second of a machine's first run, in other processes.
+
+One process finds which kernels the stages of a step would launch, without launching any, and forks others that compile
+them side by side into Triton's cache; threads of one process would wait for each other in Python. No process outlives
+the run. A file in the cache tells later runs that this is done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from sadgs_ns.events import progress
+
+_FEWEST_CORES = 3  # The run itself keeps two busy
+_LONGEST = 60.0  # Seconds without progress after which the run goes on alone
+_HERE = Path(__file__).parent
+_CARDS = Path("/proc/driver/nvidia/gpus")
+_process: subprocess.Popen[bytes] | None = None
+_found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options of each kernel, for forked processes
+
+
+def begin() -> None:
+    """Begin to compile, unless that has begun, was done before, or there is no GPU or no spare core."""
+    global _process
+    if _process is None and (marker := _marker()) and not marker.exists():
+        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        _process = subprocess.Popen(
+            [sys.executable, "-c", code, str(marker)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+
+def wait() -> None:
+    """Wait until the process of `begin` has ended, and report its progress."""
+    global _process
+    if _process is None:
+        return
+    assert _process.stdout is not None
+    told = _process.stdout.fileno()
+    while select.select([told], [], [], _LONGEST)[0] and (lines := os.read(told, 2**16)):
+        for done, total in re.findall(rb"(\d+) of (\d+)\n", lines)[-1:]:
+            progress("compiling kernels", int(done), int(total))
+    with _process:  # It ends when its input closes.
+        _process = None
+
+
+def _marker() -> Path | None:
+    """Return the file in Triton's cache that says that this was done, or None if it should not be; imports no torch."""
+    cards = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
+    if not cards or len(os.sched_getaffinity(0)) < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
+        return None
+    try:
+        key = f"{cards} {os.environ.get('CUDA_VISIBLE_DEVICES')} {version('torch')} {version('triton')} {sys.version}"
+    except PackageNotFoundError:
+        return None
+    sources = [*sorted((_HERE.parents[1] / "kernels").glob("*.py")), _HERE / "probes.py", _HERE / "compile_ahead.py"]
+    digest = hashlib.sha256(b"".join([key.encode(), *(path.read_bytes() for path in sources)])).hexdigest()
+    home = Path(os.environ.get("TRITON_HOME") or Path.home())
+    return Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache") / f"sadgs-{digest[:16]}"
+
+
+def find_kernels() -> None:
+    """Note what the stages of a step would launch; launches nothing from then on in this process."""
+    import torch
+    from triton import knobs
+    from triton.compiler import ASTSource
+    from triton.runtime import driver
+
+    from sadgs_ns import gsplat_compat
+    from sadgs_ns.kernels import tiles, trial, triton_switched
+    from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
+
+    known = set()
+
+    def note(*, key: str, fn: Any, compile: Any, **_: Any) -> bool:
+        if (fn.name, key) not in known:
+            known.add((fn.name, key))
+            source = ASTSource(fn.jit_function, compile["signature"], compile["constants"], compile["configs"][0])
+            options = json.loads(compile["specialization_data"])["options"].items()
+            options = {name: tuple(value) if isinstance(value, list) else value for name, value in options}
+            _found.append((source, driver.active.get_current_target(), options))
+        return True  # Triton neither compiles nor launches it.
+
+    def project(means: Any, quats: Any, scales: Any, opacities: Any, viewmats: Any, *_: Any) -> Any:
+        shape = len(viewmats), len(means)
+        radii = torch.ones((*shape, 2) if gsplat_compat.RADII_PER_AXIS else shape, dtype=torch.int32)
+        return radii, means.new_ones((*shape, 2)), means.new_ones(shape), means.new_ones((*shape, 3))
+
+    # gsplat would project on the GPU, and nothing counts pairs.
+    gsplat_compat.project = project
+    tiles.PairCounts.wait = lambda self: [1]
+    knobs.runtime.jit_cache_hook = note
+    trial.hash_kernels()
+    torch.set_num_threads(1)
+    stages = Stages(KernelChoice(torch.device("cpu")))
+    with triton_switched(True):
+        for stage in (*stages.alone().values(), stages.project, *stages.after_projection().values()):
+            stage()
+        Stages(KernelChoice(torch.device("cpu"), size=(4096, 4096))).tile_lists()  # More tiles have longer numbers.
+
+
+def compile_kernel(index: int) -> None:
+    """Compile a kernel that `find_kernels` noted, and what launches it, into Triton's cache."""
+    from triton import compile
+    from triton.runtime import driver
+
+    source, target, options = _found[index]
+    kernel = compile(source, target=target, options=options)
+    active: Any = driver.active
+    active.launcher_cls(source, kernel.metadata)
+
+
+def main() -> None:
+    """Compile all kernels, and tell after each how many are done, and of how many; runs in the process of `begin`."""
+    os.nice(5)  # The run must go on meanwhile.
+    find_kernels()
+    processes = min(len(_found), len(os.sched_getaffinity(0)) - 1)
+    with ProcessPoolExecutor(processes, get_context("fork"), _begin_compiler) as pool:
+        compiled = [pool.submit(compile_kernel, index) for index in range(len(_found))]
+        threading.Thread(target=_end_with_the_run, daemon=True).start()
+        for done, kernel in enumerate(as_completed(compiled), 1):
+            kernel.result()
+            print(f"{done} of {len(_found)}", flush=True)
+    Path(sys.argv[1]).touch()
+
+
+def _begin_compiler() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Only the first process tells the run, which waits until it ends.
+    threading.Thread(target=_end_with_the_run, daemon=True).start()
+
+
+def _end_with_the_run() -> None:
+    """End this process, its siblings and their children when the run closes their input, or ends."""
+    os.read(0, 1)
+    os.killpg(0, signal.SIGKILL)

@@ -1,0 +1,100 @@
+"""The checkpoint that a run goes on from, and whether it fits the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import Optimizers
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from sadgs_ns.data.cameras import camera_positions
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.geometry.initialization import camera_extent
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run import checkpoints
+from sadgs_ns.training.run.progress import note, warn
+from sadgs_ns.training.run.run_plan import RunPlan
+
+_SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' extent count as one
+
+
+@dataclass
+class Resumption:
+    """A checkpoint to load in two parts; errors are InputError, and name the file and a remedy."""
+
+    path: Path
+    state: dict[str, Any]  # As nerfstudio's trainer writes it
+
+    @contextmanager
+    def _errors_name_file(self) -> Iterator[None]:
+        try:
+            yield
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except InputError as error:
+            message = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
+            raise InputError(message) from error
+        except Exception as error:  # A file of another program may raise anything.
+            problem = f"{type(error).__name__}: {reason(error)}"
+            raise InputError(
+                f"{self.path} is not a checkpoint of this version of sadgs ({problem}): {checkpoints.REMEDY}."
+            ) from error
+
+    @property
+    def plan(self) -> RunPlan | None:
+        """The plan of the run that wrote it; None if that was another method's, which `load_gaussians` refuses."""
+        with self._errors_name_file():
+            state = self.state["pipeline"].get("_extra_state")
+            return None if state is None else RunPlan.of(state["plan"])
+
+    def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
+        """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
+        with self._errors_name_file():
+            if not world.alone:
+                part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
+                self.state = checkpoints.map_rows(self.state, lambda rows: rows[part].clone())
+            pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
+            extra = self.state["pipeline"]["_extra_state"]
+            check_same_capture(pipeline, extra["images"], extra["camera_positions"])
+            if more := sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys()):
+                remedy = "set pipeline.model.color-model and pipeline.model.camera-optimizer.mode as they were"
+                raise InputError(f"It optimized {' and '.join(more)}, too: {remedy}.")
+
+    def load_optimizers(self, optimizers: Optimizers, schedulers: bool) -> None:
+        """Load the optimizers and, if asked for, their schedulers, and print where the run goes on."""
+        with self._errors_name_file():
+            optimizers.load_optimizers(self.state["optimizers"])
+            if "schedulers" in self.state and schedulers:
+                optimizers.load_schedulers(self.state["schedulers"])
+        note(f"Resuming after step {self.state['step']} of {self.path}")
+
+
+def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
+    """Check that a checkpoint, with its images' names and cameras' centres [C, 3], is of the pipeline's data.
+
+    Images may have been added or removed if the others' poses stayed. Raises InputError if less than half of the
+    cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
+    """
+    dataset = pipeline.datamanager.train_dataset
+    now, positions = [path.name for path in dataset.image_filenames], camera_positions(dataset.cameras)
+    distances, _ = KDTree(positions).query(positions_before)  # [C]
+    same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+    if 2 * same < min(len(before), len(now)):
+        raise InputError(
+            "It was trained on other data, or with other options of the parser: of its "
+            f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
+            f"({now[0]}, …) does."
+        )
+    if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
+        warn(
+            "The checkpoint's run had the same cameras, but none of its images had the name of one of "
+            f"these ({before[0]} and {now[0]} are the first): the Gaussians fit only if the images "
+            "were renamed."
+        )

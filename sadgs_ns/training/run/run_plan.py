@@ -1,0 +1,97 @@
+"""The plan of a run: all values that `config.yml` leaves to rules, decided once before training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sadgs_ns.files import atomic_path
+from sadgs_ns.method.schedule import Schedule, between_one_and_four
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.training.step.optimizers import RunLengthDecaySchedulerConfig
+
+RATES_OF_FOUR_VIEWS = {"means": (3.0, 3.0), "opacities": (1.5, 1.5), "scales": (2.25, 0.375), "quats": (2.25, 0.375)}
+"""Factors on learning rates at the first and at the last iteration in steps of four views. Rates that fall after
+densification fall less in steps of several views, and not at all in steps of four."""
+_HEAD = "# What was decided for this run before its first step; config.yml says what was asked for.\n"
+
+
+@dataclass(frozen=True)
+class Rate:
+    """The learning rate of a group of parameters, and its decay as in `RunLengthDecaySchedulerConfig`."""
+
+    lr: float
+    initial_factor: float = 1.0
+    final_factor: float = 1.0
+    hold_share: float = 0.0
+    max_steps: int | None = None  # Iterations of the decay; None if there is none, or another kind of scheduler
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What was decided for a run, in `plan.yml` and its checkpoints; `SadgsModel.follow` replaces it."""
+
+    iterations: int  # Length of the run in optimizer steps
+    views_per_iteration: int  # Training views of a step; the loss is their mean
+    devices: int  # Number of devices, each with a process and a part of the Gaussians
+    images: str  # Where the images are kept: "gpu" (the training device), "cpu" (the host), or "compressed"
+    near_plane: float  # Depth from which Gaussians are drawn, in the run's units
+    max_off_axis: float  # As in the model's options
+    strategy: StructureAwareStrategy  # Densification with the run's windows, thresholds and cap
+    rates: dict[str, Rate]  # Learning rates by group of parameters
+    requested: dict[str, Any]  # Pipeline options from which this was derived, by their names
+
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> RunPlan:
+        """Make a plan of its `asdict`, which checkpoints hold."""
+        strategy = StructureAwareStrategy(**state["strategy"])
+        rates = {name: Rate(**rate) for name, rate in state["rates"].items()}
+        return cls(**{**state, "strategy": strategy, "rates": rates})
+
+    def write(self, folder: Path) -> None:
+        """Write `plan.yml` into a run's folder. Raise WriteError if that is not possible."""
+        with atomic_path(folder / "plan.yml") as partial:
+            partial.write_text(_HEAD + yaml.safe_dump(asdict(self), sort_keys=False), "utf8")
+
+    def optimizers(self, configs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+        """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
+        planned = {}
+        for name, rate in self.rates.items():
+            group, decay = configs[name], asdict(rate)
+            optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
+            ours = decay["max_steps"] is not None
+            scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")
+            planned[name] = {"optimizer": optimizer, "scheduler": scheduler}
+        return planned
+
+
+def plan_rates(
+    configs: Mapping[str, Mapping[str, Any]], length: Schedule, extent: float, follow_views: bool
+) -> dict[str, Rate]:
+    """Derive a run's learning rates from nerfstudio's configurations, which are for steps of one view.
+
+    That of positions is in proportion to the cameras' extent, as in 3DGS; `follow_views` uses `RATES_OF_FOUR_VIEWS`.
+    """
+    rates = {}
+    for name, group in configs.items():
+        lr, decay = group["optimizer"].lr, group.get("scheduler")
+        factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
+        start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)
+        lr *= start
+        if name == "means":
+            lr *= extent
+        if decay is None and start != end:
+            decay = RunLengthDecaySchedulerConfig()
+        if not isinstance(decay, RunLengthDecaySchedulerConfig):
+            rates[name] = Rate(lr)
+            continue
+        final = decay.final_factor * (end / start)
+        if follow_views and decay.hold_share > 0:
+            final *= between_one_and_four(length.views_per_iteration, 1 / final)
+        steps = length.iterations if decay.max_steps is None else decay.max_steps
+        rates[name] = Rate(lr, decay.initial_factor, final, decay.hold_share, steps)
+    return rates

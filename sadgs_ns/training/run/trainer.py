@@ -1,0 +1,331 @@
+"""The trainer of `ns-train sadgs`. It plans, saves and resumes a run, and ends a failed one with one sentence."""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import shlex
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sadgs_ns import events, interrupts
+from sadgs_ns.distributed.world import World
+from sadgs_ns.errors import InputError, RunError, WriteError, reason
+from sadgs_ns.interrupts import SIGNALS, Interrupted, Interrupts
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.kernels_ahead import compile_ahead
+from sadgs_ns.training.kernels_ahead.compilation import compile_kernels
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run import checkpoints, processes
+from sadgs_ns.training.run.planning import decide_near_plane, one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.run.progress import next_commands, note, remove_tables
+from sadgs_ns.training.run.resume import Resumption
+from sadgs_ns.training.run.run_folder import write_config
+from sadgs_ns.training.run.stereo_start import start_from_stereo
+from sadgs_ns.training.step.cuda_graphs import GraphedSteps
+from sadgs_ns.training.step.optimizers import SadgsOptimizers
+from sadgs_ns.training.step.train_step import training_step
+
+_LESS_MEMORY = (
+    "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
+    "(`--downscale-factor 2` after `nerfstudio-data` or `colmap`), or several devices (`--share-always True`)"
+)
+_NOTHING_DONE = "stopped before an iteration was done; the same command starts again"
+_SAVING_SHARE = 0.01  # Saving may take at most this share of the time between two checkpoints by the clock
+
+
+class SadgsTrainer(Trainer):
+    """A trainer for one or several processes, which call the same methods; rank 0 prints and writes files."""
+
+    config: SadgsTrainerConfig
+    pipeline: SadgsPipeline
+    optimizers: SadgsOptimizers
+
+    def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        interrupts.redirect_on_broken_pipe(CONSOLE)
+        config.check()
+        config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
+        if config.machine.device_type == "cuda" and local_rank == 0:
+            compile_ahead.begin()
+        self.world, local_rank = processes.join(config, local_rank)
+        self._peers = None if self.world.alone else processes.Peers(self.world)
+        if not self.world.alone:
+            with processes.local_rank_zero_first(self.world, local_rank):
+                use_triton(self.world.device)  # This compiles a kernel.
+        config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
+        self._vis: Any = config.vis
+        # nerfstudio would wrap the pipeline for several devices in its own way.
+        super().__init__(config, local_rank, world_size=1)
+        self._stepping = False
+        self.graphed: GraphedSteps | None = None
+        self._resumed: Resumption | None = None
+        self._completed_step = self._saved_step = -1
+        self._save_due = math.inf
+        # While a run is paused or done, nerfstudio waits for the viewer's user, and nobody polls.
+        self._interrupts = Interrupts(
+            waiting=lambda: self.training_state != "training" and not self._stepping, started=not self.world.alone
+        )
+
+    def setup(self, *args: Any, **kwargs: Any) -> None:
+        """Load data, model and checkpoint, and compile kernels, or raise InputError, RunError, SystemExit on SIGINT."""
+        try:
+            super().setup(*args, **kwargs)
+            plan = self.pipeline.model.plan
+            if processes.is_rank_zero():
+                plan.write(self.base_dir)
+            events.report("training begins", iterations=plan.iterations)
+            last = [TrainingCallbackLocation.AFTER_TRAIN]
+            self.callbacks.append(TrainingCallback(last, lambda step: self._print_next_commands()))
+            with processes.local_rank_zero_first(self.world, self.local_rank):
+                compile_kernels(self.pipeline, self.optimizers.optimizers)
+            model = self.pipeline.model
+            # In a graphed step the host must not wait, and cameras must not move.
+            known = self.world.alone and model.backend == "triton" and model.tile_forecast is not None
+            if self.config.cuda_graphs and known and model.camera_optimizer.config.mode == "off":
+                self.graphed = GraphedSteps(model)
+        except RuntimeError as error:
+            self._explain(error, "is too small to start", _LESS_MEMORY, _NOTHING_DONE)
+            raise
+        except KeyboardInterrupt:
+            note(f"SIGINT: {_NOTHING_DONE}.")
+            raise SystemExit(128 + signal.SIGINT) from None
+
+    def _explain(self, error: RuntimeError, full: str, remedy: str, kept: str) -> None:
+        """Raise RunError instead of an error of full memory, or one that another process had first."""
+        if isinstance(error, torch.cuda.OutOfMemoryError):
+            asked_for = ". ".join(reason(error).split(". ")[:2]).rstrip(".")  # Torch has many more sentences.
+            raise RunError(f"The GPU's memory {full} ({asked_for}): {remedy}.") from error
+        if not isinstance(error, RunError) and self._peers is not None and self._peers.ended():
+            raise RunError(f"Another process of the run ended, and this one with it: {kept}.") from error
+
+    def _print_next_commands(self) -> None:
+        """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
+        if not self.pipeline.diverged:
+            note(next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians))
+            events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
+
+    def _load_checkpoint(self) -> None:
+        """Load the checkpoint's optimizers; `setup_optimizers` has loaded its Gaussians."""
+        if self._resumed is None:
+            return super()._load_checkpoint()
+        self._resumed.load_optimizers(self.optimizers, self.config.load_scheduler)
+        self._resumed = None
+
+    def setup_optimizers(self) -> SadgsOptimizers:
+        """Load the Gaussians of a checkpoint, if there is one, plan the run, and build its optimizers."""
+        config, pipeline = self.config, self.pipeline
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        self._resumed = resumed = None if chosen is None else Resumption(*chosen)
+        before = None if resumed is None else resumed.plan
+        near_plane = decide_near_plane(pipeline, before)
+        dense = start_from_stereo(pipeline, resumed=resumed is not None)
+        cameras = pipeline.datamanager.train_dataset.cameras
+        if resumed is None:
+            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds), near_plane)
+        length = plan_length(config, len(cameras), before)
+        peers, views = None if config.share_always else self._peers, length.views_per_iteration
+        if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
+            processes.continue_on_rank_zero(self.world, peers)
+            self.world, self._peers = World(), None
+        if not self.world.alone:
+            if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
+                note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
+                others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
+                config.vis = others or "none"  # type: ignore[assignment]
+            pipeline.model.shard(self.world)
+        if resumed is not None:
+            resumed.load_gaussians(pipeline, self.world)
+            self._start_step = resumed.state["step"] + 1
+        pipeline.check_visibility(near_plane)
+        plan = plan_run(
+            config, pipeline, length, near_plane=near_plane, dense=dense, before=before, done=self._start_step
+        )
+        pipeline.follow(plan)
+        config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
+        return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
+
+    def train(self) -> None:
+        """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
+
+        Raises RunError if memory is full or the run has diverged; InputError if an image cannot be decoded any more;
+        WriteError if a checkpoint or log could not be written; SystemExit after a signal, once a checkpoint is saved.
+        """
+        total = self.pipeline.model.plan.iterations
+        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint if nothing is left to do
+        self._completed_step = self._saved_step = self._start_step - 1
+        self.config.max_num_iterations = max(total - self._start_step, 0)
+        if self._start_step >= total:
+            writer.GLOBAL_BUFFER["step"] = self.step  # Only an iteration would set it.
+            told = f"This run is finished after {self._start_step} iterations"
+            note(f"{told}: --max-num-iterations of more than {self._start_step} trains on.")
+        self._set_clock(0.0)
+        events.report("loop begins")
+        try:
+            self._train_until_interrupted(total)
+        except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
+            raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
+        except RuntimeError as error:
+            full = f"was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
+            self._explain(error, full, f"{_LESS_MEMORY}; {self._resume}", self._resume)
+            raise
+        finally:
+            self.config.max_num_iterations = total
+            self.pipeline.views.close()
+            remove_tables()
+        processes.leave()
+
+    def _train_until_interrupted(self, total: int) -> None:
+        """Train as nerfstudio does, unless a signal (SystemExit) or a logger's error stops the run, which saves it."""
+        with self._interrupts:
+            try:
+                if not self.world.alone:  # Making it as nerfstudio does fails if another process is as fast.
+                    self.base_dir.mkdir(parents=True, exist_ok=True)
+                super().train()
+                self._stop_if_diverged()
+            except Interrupted as interrupted:
+                self._stop(interrupted, total)
+            except OSError as error:
+                if error.errno is None:  # This is a WriteError, or not from the disk.
+                    raise
+                # A logger could not write, perhaps to another disk, or to a terminal whose SIGHUP is on its way.
+                if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
+                    self.save_checkpoint(self._completed_step)
+                raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
+
+    @property
+    def _resume(self) -> str:
+        """What to tell the user after an error between two checkpoints."""
+        if not any(self.checkpoint_dir.glob("*.ckpt")):
+            return "this run has made no checkpoint yet"
+        return f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
+
+    def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
+        """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
+        self._stepping = True
+        # Several processes agree in the step what to do after it. A signal has the bit of its number.
+        self.world.flags_in, signalled = 0, self._interrupts.received
+        bit = 0 if signalled is None else 1 << signalled
+        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
+        pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
+        if graphed is not None and model.tile_forecast is not None:
+            model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
+        groups, update = pipeline.next_views(step), self.optimizers.update()
+        inputs = groups, model.opacity_reg_now, update
+        factors = update.factors()
+        nonfinite_flag = pipeline.log.nonfinite_flag
+        result = None if graphed is None else graphed.replay(*inputs, factors, nonfinite_flag)
+        if result is None:
+            factors = factors.to(update.device, non_blocking=True)
+            result = training_step(model, *inputs, factors, nonfinite_flag)
+        pipeline.finish_step(step, groups, result)
+        self.optimizers.scheduler_step_all(step)
+        metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}
+        model.camera_optimizer.get_metrics_dict(metrics)
+        return result.loss, {"main_loss": result.loss}, metrics
+
+    def _update_viewer_state(self, step: int) -> None:
+        """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
+        self._completed_step, self._stepping = step, False
+        if self.world.alone:
+            self._interrupts.poll()
+            due = time.monotonic() >= self._save_due
+        else:
+            due = bool(self.world.flags_in & 1)
+            for number in SIGNALS:
+                if self.world.flags_in >> number & 1:
+                    raise Interrupted(number)
+        self._stop_if_diverged()
+        if due:
+            self.save_checkpoint(step)
+        super()._update_viewer_state(step)
+
+    def _after_train(self) -> None:
+        events.report("loop ends")
+        super()._after_train()
+
+    def eval_iteration(self, step: int) -> None:
+        """Measure held-out views as nerfstudio does, if one device holds all Gaussians."""
+        if self.world.alone:
+            super().eval_iteration(step)
+
+    def _train_complete_viewer(self) -> None:
+        """Wait for the viewer's user, as nerfstudio does, unless the run must stop."""
+        self._interrupts.poll()
+        self._stop_if_diverged()
+        super()._train_complete_viewer()
+
+    def _set_clock(self, took: float) -> None:
+        """Set when the next checkpoint is due, after one that took `took` seconds to save."""
+        config = self.config
+        by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
+        wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
+        self._save_due = time.monotonic() + wait
+
+    def _stop(self, interrupted: Interrupted, total: int) -> None:
+        """Save a checkpoint, and name it in `config.yml`; return if the run was done, else raise SystemExit."""
+        if self._completed_step > self._saved_step:
+            self.save_checkpoint(self._completed_step)
+        done = self._completed_step + 1
+        if done >= total:
+            return
+        if done == self._start_step:
+            text = f"{interrupted}: {_NOTHING_DONE}."
+        else:
+            # With --load-config nerfstudio takes all options from this file.
+            config = copy.copy(self.config)
+            config.max_num_iterations = total
+            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
+            config.vis = self._vis
+            file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
+            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
+            text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
+        if interrupted.number == signal.SIGHUP:  # Some systems take the terminal away later.
+            interrupts.discard_broken_output()
+        note(text)
+        self.world.all(True)  # As soon as one process has ended, the others are ended.
+        raise SystemExit(128 + interrupted.number)
+
+    def _stop_if_diverged(self) -> None:
+        """Save the Gaussians and raise RunError if the run has diverged."""
+        if not self.pipeline.diverged:
+            return
+        kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
+        finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
+        if self.world.all(finite):
+            if self._completed_step > self._saved_step:
+                self.save_checkpoint(self._completed_step)
+            kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
+        remedy = "look at them with sadgs-doctor, and lower the learning rates if you raised them"
+        raise RunError(f"{self.pipeline.diverged}; {remedy}; {kept}.")
+
+    def save_checkpoint(self, step: int) -> None:
+        """Save as `checkpoints.write` does. Rank 0 gathers and writes the Gaussians of all processes."""
+        start = time.monotonic()
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+        }
+        if not self.world.alone:
+            state = checkpoints.map_rows(state, self.world.gather_rows)
+        if processes.is_rank_zero():
+            # If the run has diverged, an earlier checkpoint may be better.
+            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
+            checkpoints.write(self.checkpoint_dir, step, state, keep)
+        self.world.all(True)
+        self._saved_step = step
+        self._set_clock(time.monotonic() - start)

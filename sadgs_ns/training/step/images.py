@@ -1,0 +1,249 @@
+"""Images that are decoded and undistorted when they are needed, or copied to the device ahead of their step."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
+from nerfstudio.data.datasets.base_dataset import InputDataset
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.training.run.processes import processes_on_this_machine
+
+_Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
+"""Takes data and image [H, W(, C)]; returns intrinsics in px [3, 3], image, and perhaps mask [H, W, 1] undistorted."""
+
+
+def thread_count(requested: int | None) -> int:
+    """Return the number of threads that decode images in this process; by default one per core, up to 16."""
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    return requested or min(max(cores // processes_on_this_machine(), 1), 16)
+
+
+def stack(tensors: Sequence[Tensor]) -> Tensor:
+    """Stack tensors as `torch.stack` does, but do not copy a single one."""
+    if len(tensors) == 1:
+        return tensors[0][None]
+    return torch.stack(list(tensors))
+
+
+def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: torch.device) -> Tensor | None:
+    """Return masks of views of one size (H, W), ones where a view has none; None if no view has. bool [V, H, W, 1]"""
+    if not any("mask" in view for view in data):
+        return None
+    everything = torch.ones((*size, 1), dtype=torch.bool, device=device)
+    return stack([view.get("mask", everything).to(device, non_blocking=True) for view in data])
+
+
+class LazyImages(Sequence[dict[str, Any]]):
+    """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
+
+    Several threads may access images. The dataset's cameras become those of the undistorted images, none opened.
+    """
+
+    def __init__(self, dataset: InputDataset) -> None:
+        self._names = dataset.image_filenames
+        self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
+        self._undistort = _undistort_cameras(dataset.cameras)
+        self._dataset = copy.copy(dataset)
+        self._opencv_agrees: bool | None = None  # None until a JPEG has been decoded
+        if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
+            self._dataset.get_numpy_image = self._decode
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return `image` uint8 [H, W, 3 or 4], undistorted and on the CPU, and perhaps a boolean `mask` [H, W, 1].
+
+        Raises InputError if image or mask cannot be read, or has another size than its camera.
+        """
+        name = self._names[index]
+        size = tuple(self._sizes[index])
+        undistort = self._undistort[index]
+        try:
+            data = self._dataset.get_data(index, image_type="uint8")
+        except MemoryError:
+            raise
+        except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
+            broken = name
+            if self._dataset._dataparser_outputs.mask_filenames is not None:
+                broken = f"{name} or its mask"
+            raise InputError(
+                f"{broken} cannot be read as an image ({reason(error)}): copy it again, or leave it out of the "
+                "reconstruction."
+            ) from error
+        image: Tensor = data["image"]
+        width_and_height = (image.shape[1], image.shape[0])
+        if width_and_height != size:
+            sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)
+            raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
+        if undistort is not None:
+            _, undistorted, mask = undistort(data, image.numpy())
+            image = torch.from_numpy(np.ascontiguousarray(undistorted))  # The crop is a view of the larger image.
+            if mask is not None:
+                data["mask"] = mask.contiguous()
+        return {**data, "image": image}
+
+    def _decode(self, image_idx: int) -> NDArray[np.uint8]:
+        """Decode an image as nerfstudio does, or a JPEG with OpenCV if that gives the same pixels. [H, W, 3 or 4]
+
+        For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms.
+        """
+        content = self._names[image_idx].read_bytes()
+        image = None
+        if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":
+            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is not None:
+            image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            if self._opencv_agrees:
+                return image  # type: ignore[return-value]
+        expected = InputDataset.get_numpy_image(self._dataset, image_idx)
+        if image is not None:
+            self._opencv_agrees = np.array_equal(image, expected)
+        return expected
+
+
+def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
+    """Give cameras their undistorted images' intrinsics and sizes; return what undistorts each image, or None."""
+    undistorts: list[_Undistort | None] = [None] * len(cameras)
+    distortion = cameras.distortion_params  # [C, D]
+    if distortion is None or not distortion.any():
+        return undistorts
+    fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
+    rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
+    known: dict[bytes, tuple[_Undistort, NDArray[np.float32], NDArray[Any]]] = {}
+    for index in distortion.any(dim=-1).nonzero().flatten().tolist():
+        row = rows[index].tobytes()
+        if row not in known:
+            undistort = _undistort_as(cameras[index].reshape(()))
+            # The new intrinsics do not depend on the pixels.
+            empty = np.zeros((int(cameras.height[index]), int(cameras.width[index])), np.uint8)
+            known[row] = undistort, *undistort({}, empty)[:2]
+        undistorts[index], K, image = known[row]
+        cameras.fx[index] = float(K[0, 0])
+        cameras.fy[index] = float(K[1, 1])
+        cameras.cx[index] = float(K[0, 2])
+        cameras.cy[index] = float(K[1, 2])
+        cameras.width[index] = image.shape[1]
+        cameras.height[index] = image.shape[0]
+    return undistorts
+
+
+def _undistort_as(camera: Cameras) -> _Undistort:
+    """Return a function that undistorts images of a camera, without batch dimension, as it is now."""
+    camera = copy.deepcopy(camera)
+    K = camera.get_intrinsics_matrices().numpy()
+    distortion = camera.distortion_params.numpy()  # type: ignore[union-attr]
+    return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
+
+
+class ImagePrefetcher:
+    """Copies images from the host to the device ahead of the step that needs them, on its own stream.
+
+    Threads decode `LazyImages` and pin them; those that are `decoded` need none. Without CUDA only decoding runs ahead.
+    """
+
+    def __init__(self, images: Sequence[Mapping[str, Any]], device: torch.device, threads: int) -> None:
+        self.images = images
+        self.device = device
+        self.threads = threads
+        on_cuda = device.type == "cuda"
+        self.decoded = isinstance(images, list) and all(not on_cuda or data["image"].is_pinned() for data in images)
+        self._stream = None
+        if on_cuda:
+            self._stream = torch.cuda.Stream(device)
+        self._pool: ThreadPoolExecutor | None = None
+        self._loading: dict[int, Future[dict[str, Any]]] = {}
+        self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}
+
+    def take(self, indices: Sequence[int]) -> dict[int, dict[str, Any]]:
+        """Return data of a step's views by index, on the device, for this stream; only decoding is waited for."""
+        self._load(indices)
+        data_by_view = {}
+        for index in indices:
+            data_by_view[index], copied = self._sent.pop(index, None) or self._copy(index)
+            if copied is not None:
+                stream = torch.cuda.current_stream(self.device)
+                stream.wait_event(copied)
+                for value in data_by_view[index].values():
+                    if isinstance(value, Tensor) and value.is_cuda:
+                        value.record_stream(stream)  # Its memory belongs to the copying stream.
+        return data_by_view
+
+    def prefetch(self, upcoming: Sequence[int], following: Sequence[int]) -> None:
+        """Load the images of upcoming views, drop all others, and start copies of loaded ones of the following step."""
+        for index in self._loading.keys() - set(upcoming):
+            self._loading.pop(index).cancel()
+        for index in self._sent.keys() - set(upcoming):
+            del self._sent[index]
+        self._load(upcoming)
+        for index in following:
+            if index not in self._sent and (self.decoded or self._loading[index].done()):
+                self._sent[index] = self._copy(index)
+
+    def close(self) -> None:
+        """End the threads; they start again if another image is needed."""
+        pool = self._pool
+        self._pool = None
+        self._loading.clear()
+        self._sent.clear()
+        if pool is not None:
+            pool.shutdown(cancel_futures=True)
+
+    def _load(self, indices: Iterable[int]) -> None:
+        """Let threads load images in this order, unless they are being loaded."""
+        if self.decoded:
+            return
+        for index in indices:
+            if index in self._loading or index in self._sent:
+                continue
+            if self._pool is None:
+                initializer: Any = ()
+                if self._stream is not None:
+                    initializer = (torch.cuda.set_device, (self.device,))
+                self._pool = ThreadPoolExecutor(self.threads, "images", *initializer)
+            self._loading[index] = self._pool.submit(self._pinned, index)
+
+    def _pinned(self, index: int) -> dict[str, Any]:
+        """Return a view's data on the host, with CUDA in pinned memory; this runs in a thread."""
+        data = dict(self.images[index])
+        if self._stream is None:
+            return data
+        return _map_tensors(data, lambda tensor: tensor.pin_memory())
+
+    def _copy(self, index: int) -> tuple[dict[str, Any], torch.cuda.Event | None]:
+        """Return a view's data on the device, and with CUDA the event of their arrival."""
+        if self.decoded:
+            data = dict(self.images[index])
+        else:
+            data = self._loading.pop(index).result()
+        if self._stream is None:
+            return data, None
+        with torch.cuda.stream(self._stream):
+            data = _map_tensors(data, lambda tensor: tensor.to(self.device, non_blocking=True))
+            copied = torch.cuda.Event()
+            copied.record(self._stream)
+        return data, copied
+
+
+def _map_tensors(data: Mapping[str, Any], function: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Return a view's data with a function applied to its tensors; other values stay."""
+    mapped = dict(data)
+    for name, value in data.items():
+        if isinstance(value, Tensor):
+            mapped[name] = function(value)
+    return mapped

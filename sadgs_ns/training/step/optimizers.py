@@ -1,0 +1,174 @@
+"""Adam in one launch for all parameters, and learning rates that decay over the run's length."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from inspect import unwrap
+from typing import Any
+
+import torch
+from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch import Tensor
+from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+from tyro.conf import Suppress
+
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.training.options import hide
+from sadgs_ns.training.step.nonfinite import MAX_GRADIENT, leave_out_nonfinite
+
+_ONE = torch.tensor(1.0, device="cpu")  # Adding this to a count of steps takes a third of the time of adding Python's 1
+
+
+class FusedAdam(Adam):
+    """torch's fused Adam of one parameter, or its state that our kernel updates."""
+
+    # Around these methods torch has others that import its compiler, which takes a second.
+    add_param_group = unwrap(Adam.add_param_group)
+    state_dict = unwrap(Adam.state_dict)
+    load_state_dict = unwrap(Adam.load_state_dict)
+    step = torch.no_grad()(unwrap(Adam.step))
+
+    def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
+        (parameter,) = params
+        # torch's fused Adam keeps the step count on the device, where the host would have to wait for it.
+        super().__init__([parameter], fused=not use_triton(parameter.device), **options)
+
+
+class AdamUpdate:
+    """An update of parameters, given by name, by our kernel, or else by torch's fused Adam, all on one device.
+
+    One launch of the kernel updates all parameters of one length with equal betas and eps, which spares the host's
+    time. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
+    """
+
+    def __init__(self, optimizers: Mapping[str, Adam]) -> None:
+        alike: dict[Any, dict[str, Adam]] = {}
+        for name, optimizer in optimizers.items():
+            group = optimizer.param_groups[0]
+            alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
+        self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
+        self._optimizers = {name: adam for chosen in alike.values() for name, adam in chosen.items()}
+        self._groups = [adam.param_groups[0] for adam in self._optimizers.values()]
+        present = (group["params"][0] for group in self._groups)
+        self.parameters: dict[str, Tensor] = dict(zip(self._optimizers, present, strict=True))
+        self.device = next(iter(self.parameters.values())).device
+        self._triton = use_triton(self.device)
+        self._states = [self._optimizers[name].state[parameter] for name, parameter in self.parameters.items()]
+        for state, parameter in zip(self._states, self.parameters.values(), strict=True):
+            if self._triton and not state:
+                state["step"] = torch.tensor(0.0)
+                state["exp_avg"] = torch.zeros_like(parameter)
+                state["exp_avg_sq"] = torch.zeros_like(parameter)
+        self.exp_avgs, self.exp_avg_sqs = (
+            tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
+        )
+
+    def factors(self) -> Tensor:
+        """Count an update of each parameter, and return our kernel's factors, on the (pinned) host. float32 [2, P]"""
+        if not self._triton:
+            return torch.empty((2, 0))
+        from sadgs_ns.kernels.adam import rate_and_scale
+
+        columns = []
+        for state, group in zip(self._states, self._groups, strict=True):
+            state["step"] = state["step"].cpu() + _ONE
+            columns.append(rate_and_scale(int(state["step"]), group["lr"], group["betas"]))
+        return torch.tensor(list(zip(*columns, strict=True)), pin_memory=self.device.type == "cuda")
+
+    @torch.no_grad()
+    def launch(
+        self,
+        gradients: Mapping[str, Tensor],
+        factors: Tensor,
+        nonfinite_flag: Tensor,
+        overflowed: tuple[Tensor, ...] = (),
+    ) -> None:
+        """Update the parameters by gradients of their names; `nonfinite_flag` [1] becomes NaN if one was not finite.
+
+        `factors` are on the device, and `overflowed` is as for `kernels.adam.adam_step`; torch's Adam ignores both.
+        """
+        if not self._triton:
+            for name, optimizer in self._optimizers.items():
+                leave_out_nonfinite(gradients[name], nonfinite_flag)
+                self.parameters[name].grad = gradients[name]
+                optimizer.step()
+                self.parameters[name].grad = None
+            return
+        from sadgs_ns.kernels.adam import adam_step
+
+        begin = 0
+        for (_, betas, eps), names in self._launches:
+            part = slice(begin, begin + len(names))
+            begin = begin + len(names)
+            parameters = tuple(self.parameters[name] for name in names)
+            in_order = tuple(gradients[name].contiguous() for name in names)
+            adam_step(
+                parameters, in_order, self.exp_avgs[part], self.exp_avg_sqs[part], factors[:, part], nonfinite_flag,
+                overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
+            )  # fmt: skip
+
+
+class SadgsOptimizers(Optimizers):
+    """nerfstudio's set of optimizers, each a `FusedAdam`, whose parameters are updated together."""
+
+    def __init__(self, config: dict[str, Any], param_groups: dict[str, list[torch.nn.Parameter]]) -> None:
+        super().__init__(config, param_groups)
+        # nerfstudio would keep the first parameters, which densification replaces, to clip their gradients.
+        self.parameters.clear()
+
+    def update(self) -> AdamUpdate:
+        """Return an update of all present parameters that are not empty."""
+        adams: Any = self.optimizers.items()
+        for _, adam in adams:
+            adam._opt_called = True  # for torch's schedulers
+        return AdamUpdate({name: adam for name, adam in adams if adam.param_groups[0]["params"][0].numel()})
+
+
+@hide("max_norm", "weight_decay")
+@dataclass
+class FusedAdamOptimizerConfig(AdamOptimizerConfig):
+    """Adam; only its rate is an option on the command line."""
+
+    _target: type = FusedAdam
+    lr: float = 1e-3
+    """Learning rate; where there is a schedule, its factors multiply it."""
+    eps: Suppress[float] = 1e-15
+    """Adam adds this to the root of the second moment; as in 3DGS."""
+
+
+@dataclass
+class RunLengthDecaySchedulerConfig(SchedulerConfig):
+    """Exponential decay over the run, or over its last part, whatever `--max-num-iterations` is."""
+
+    _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
+    initial_factor: Suppress[float] = 1.0
+    """Learning rate at the first iteration, relative to the optimizer's."""
+    final_factor: float = 1.0
+    """Learning rate at the last iteration, relative to the optimizer's."""
+    hold_share: Suppress[float] = 0.0
+    """Share of the run in [0, 1) in which the learning rate stays as at the first iteration."""
+    max_steps: Suppress[int | None] = None
+    """Iterations until `final_factor`; None is the length of the run."""
+
+
+class RunLengthDecayScheduler(Scheduler):
+    """lr(t) = lr · initial^(1−t) · final^t with t the fraction of the run after `hold_share` that has passed."""
+
+    config: RunLengthDecaySchedulerConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
+        """Make torch's scheduler, whose state torch's safe loader can load."""
+        max_steps = self.config.max_steps
+        hold = self.config.hold_share
+        initial = self.config.initial_factor
+        final = self.config.final_factor
+        assert max_steps is not None, "the plan of the run sets it"
+
+        def factor(step: int) -> float:
+            t = min(max((step / max(max_steps, 1) - hold) / (1 - hold), 0.0), 1.0)
+            return float(initial ** (1 - t) * final**t)
+
+        return LambdaLR(optimizer, factor)

@@ -1,0 +1,181 @@
+"""A training step: render views, compare them with their photos, differentiate, update all parameters.
+
+One function serves every run. Several processes come in at `distributed.rasterization.rasterize`, and CUDA graphs
+where the trainer replays a step instead of calling it (cuda_graphs.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sadgs_ns.distributed.bands import Band
+from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.method.losses import photometric_loss, photometric_part
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
+from sadgs_ns.training.step.images import stack, stack_masks
+from sadgs_ns.training.step.optimizers import AdamUpdate
+
+
+@dataclass(frozen=True)
+class ViewGroup:
+    """Views of a step that have one size, on the training device."""
+
+    indices: list[int]  # Indices of V training views
+    cameras: Cameras
+    options: RenderOptions
+    data: Sequence[Mapping[str, Tensor]]
+    """`image` of each view, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps `mask`, bool [H, W, 1]. With several
+    processes, views that only others composite have none."""
+    view_ids: Tensor | None = None  # `indices` on the device if views have colour matrices. int64 [V]
+    structure_tensors: Tensor | None = None  # Quantized S̄ if η is observed. uint8 [V, H, W, 3]
+    images: Tensor | None = None  # The images, if they are in one tensor already. [V, H, W, 3]
+
+    def batch(self, band: Band | None) -> dict[str, Tensor]:
+        """Return `image` and, if a view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
+        if band is not None:
+            rows = slice(band.top, band.bottom)
+            data = self.data[band.view]
+            return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
+        batch = {"image": stack([data["image"] for data in self.data]) if self.images is None else self.images}
+        masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
+        return batch if masks is None else batch | {"mask": masks}
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The results of a step on the device."""
+
+    loss: Tensor  # Loss of all processes, without gradient, a scalar
+    psnr: Tensor  # PSNR of the views in dB, a scalar
+    means_gradient: Tensor  # Gradient of the loss by the centres. [N, 3]
+    infos: list[dict[str, Any]]  # The rasterizer's info of each group of views
+
+
+def training_step(
+    model: SadgsModel,
+    groups: Sequence[ViewGroup],
+    opacity_reg: float,  # Factor on the mean opacity in the loss
+    update: AdamUpdate,  # The update of all parameters
+    factors: Tensor,  # What `AdamUpdate.factors` returned, on the device
+    nonfinite_flag: Tensor,  # Becomes NaN if a gradient was not finite. float32 [1]
+) -> StepResult:
+    """Train on the views of a step; the loss is their mean. This enqueues work and changes tensors only.
+
+    It waits for none of it; only several processes wait for the numbers of Gaussians that they send each other. If the
+    tile lists of a group were too short, it was not drawn and gives no gradient. If all were, nothing changes.
+    """
+    world = model.strategy.world
+    # Gradients of the parameters themselves would add up on the stream of their first use, where no graph is captured.
+    leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
+    for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
+        update.parameters[name].grad = None
+    if not world.alone:
+        opacity_reg *= len(leaves["means"]) / world.total  # The mean is over the Gaussians of all processes.
+    gaussians, penalty = model.gaussians(leaves, opacity_reg)
+    if world.alone and len(groups) == 1:
+        # The kernel adds the penalty to the loss of a single group.
+        losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, penalty)
+    else:
+        losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, None)
+        if penalty is not None:
+            losses.append(penalty.sum())
+    pose_penalties: dict[str, Tensor] = {}
+    model.camera_optimizer.get_loss_dict(pose_penalties)
+    losses += pose_penalties.values()
+    loss = reduce(torch.add, losses)
+    loss.backward()
+    learned = {name: leaves.get(name, parameter) for name, parameter in update.parameters.items()}
+    gradients = {name: _gradient_of(leaf) for name, leaf in learned.items()}
+    overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
+    update.launch(gradients, factors, nonfinite_flag, overflowed)
+    model.strategy.accumulate(model.strategy_state, model.step, infos)
+    loss = loss.detach()
+    if world.alone:
+        psnr = reduce(torch.add, qualities)
+    else:
+        loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))
+        psnr = -10 * error.log10()
+    return StepResult(loss, psnr, gradients["means"], infos)
+
+
+def _render_and_compare(
+    model: SadgsModel,
+    groups: Sequence[ViewGroup],
+    gaussians: Gaussians,
+    leaves: Mapping[str, Tensor],  # The parameters by name, of which the Gaussians were made
+    penalty: Tensor | None,  # Numbers whose sum is added to the loss of a single group
+) -> tuple[list[Tensor], list[Tensor], list[dict[str, Any]]]:
+    """Render the views of a step and compare them with their photos.
+
+    Returns:
+        Losses, whose sum is that of the step. Qualities, whose sum is the mean PSNR in dB; with several processes, the
+        mean square error. The rasterizer's info of each group, in which η was observed if that is due.
+    """
+    world = model.strategy.world
+    num_views = sum(len(group.indices) for group in groups)
+    losses: list[Tensor] = []
+    qualities: list[Tensor] = []
+    infos: list[dict[str, Any]] = []
+    # All processes have the same groups, and autograd goes back through them in the same order.
+    for group in groups:
+        pictures, info = rasterize(world, gaussians, group.cameras, group.options)
+        viewmats, Ks = group.cameras[:2]
+        info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
+        model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
+        infos.append(info)
+        for band, colors, alphas in pictures:
+            if group.view_ids is not None:
+                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
+            rgb = model.before_background(colors, alphas, model.background)
+            pair = model.masked_pair(rgb, group.batch(band), model.background)
+            loss, quality, views = _compare(pair, group, band, model.config.ssim_lambda, penalty)
+            if views != num_views:
+                loss = views / num_views * loss
+                quality = views / num_views * quality
+            losses.append(loss)
+            qualities.append(quality)
+        anchor = info.pop("anchor", None)
+        if anchor is not None:
+            losses.append(anchor)
+    return losses, qualities, infos
+
+
+def _compare(
+    pair: tuple[Tensor, Tensor],  # A rendering and its photo [V, H, W, 3], of a band its rows alone
+    group: ViewGroup,
+    band: Band | None,
+    ssim_lambda: float,
+    penalty: Tensor | None,  # Numbers whose sum is added to the loss of a whole group
+) -> tuple[Tensor, Tensor, int]:
+    """Return the loss of a group or of one view's band, its quality, and the number of views that both are of.
+
+    The quality is PSNR in dB of a group, and the mean square error of a band.
+    """
+    predicted, target = pair
+    if band is None:
+        loss, quality = photometric_loss(predicted, target, ssim_lambda=ssim_lambda, parts=penalty)
+        return loss, quality, len(group.indices)
+    loss, quality = photometric_part(
+        predicted,
+        target,
+        rows=(band.first, band.last),
+        top=band.top,
+        height=group.cameras.height,
+        ssim_lambda=ssim_lambda,
+    )
+    return loss, quality, 1
+
+
+def _gradient_of(leaf: Tensor) -> Tensor:
+    """Return the gradient of a tensor, zeros if it has none."""
+    if leaf.grad is None:
+        return torch.zeros_like(leaf)
+    return leaf.grad

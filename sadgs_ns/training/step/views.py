@@ -1,0 +1,171 @@
+"""The training views: which of them each step takes, and their images and cameras on the training device."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import chain
+from typing import Any
+
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from torch import Tensor
+
+from sadgs_ns.data.cameras import check_undistortion
+from sadgs_ns.distributed.bands import views_of_rank
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.step.images import ImagePrefetcher, thread_count
+
+
+class ViewSampler:
+    """Draws the training views of each step. Each round has every view once, in an order that the seed decides.
+
+    If a round ends inside a step, the step continues with views of the next round that it does not have yet; those it
+    skips come first in the next step. So no view is drawn twice in a step, unless the step takes more than there are.
+    """
+
+    def __init__(self, num_views: int, seed: int) -> None:
+        self.num_views = num_views
+        self._generator = random.Random(seed)
+        self._order: list[int] = []  # Views to come; another round is appended when a step needs it
+
+    def draw(self, number: int) -> list[int]:
+        """Return the indices of the next step's views."""
+        return self._take_step(self._order, number)
+
+    def foresee(self, number: int, steps: int) -> list[list[int]]:
+        """Return what `draw` will return in the next steps, unless views are requeued."""
+        order = [*self._order]
+        return [self._take_step(order, number) for _ in range(steps)]
+
+    def requeue(self, views: Sequence[int]) -> None:
+        """Put these views first again, because their step did not count."""
+        self._order[:0] = views
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the views to come and the state of the generator of later rounds."""
+        return {"num_views": self.num_views, "order": [*self._order], "generator": self._generator.getstate()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue a saved order, unless the number of views has changed."""
+        if state["num_views"] == self.num_views:
+            self._order = [*state["order"]]
+            self._generator.setstate(state["generator"])
+
+    def _take_step(self, order: list[int], number: int) -> list[int]:
+        """Take the views of a step from an order, the sampler's own or a copy of it."""
+        step: list[int] = []
+        while len(step) < number:
+            drawn = step[len(step) // self.num_views * self.num_views :]  # Beyond all views, each comes again.
+            place = next((place for place, view in enumerate(order) if view not in drawn), None)
+            if place is not None:
+                step.append(order.pop(place))
+                continue
+            following = list(range(self.num_views))
+            self._generator.shuffle(following)
+            self._order += following
+            if order is not self._order:
+                order += following
+        return step
+
+
+class TrainingViews:
+    """Draws training views, the same in all processes, and gives their images and corrected cameras."""
+
+    def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
+        self.datamanager = datamanager
+        self.model = model
+        self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
+
+    def __len__(self) -> int:
+        """Number of training views."""
+        return self.sampler.num_views
+
+    @cached_property
+    def prefetcher(self) -> ImagePrefetcher | None:
+        """Brings images from the host ahead of their step; None if all images are on the device."""
+        config = self.datamanager.config
+        if config.cache_images == "gpu":
+            return None
+        threads = thread_count(config.max_thread_workers)
+        return ImagePrefetcher(self.datamanager.cached_train, self.model.device, threads)
+
+    @cached_property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Height and width in px of all training images."""
+        _ = self.datamanager.cached_train  # Undistorting the images has changed their sizes.
+        cameras = self.datamanager.train_dataset.cameras
+        return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
+
+    def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+        """Return index and data of each view of the next step, and prefetch images of later ones.
+
+        The image is on the training device, and so is the mask if it was prefetched. With several processes, prefetched
+        data is there only of views that this process composites. Raises as `ImagePrefetcher.take`.
+        """
+        indices = self.sampler.draw(number)
+        prefetcher = self.prefetcher
+        if prefetcher is None:
+            cached = self.datamanager.cached_train
+            device = self.model.device
+            return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
+        data = prefetcher.take(self._composited(indices))
+        share = math.ceil(number / self.model.world.num_ranks)
+        threads = prefetcher.threads
+        steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
+        # The number of views under way is the same in each step, so that none is forgotten before its step.
+        most = max(threads + 2 * share, len(steps[0]))
+        prefetcher.prefetch(list(dict.fromkeys(chain(*steps)))[:most], following=steps[0])
+        return [(index, data.get(index, {})) for index in indices]
+
+    def _composited(self, indices: Sequence[int]) -> list[int]:
+        """Return the views of a step, each once, of which this process composites rows."""
+        world = self.model.world
+        if not world.alone:
+            sizes = tuple(self.sizes[index] for index in indices)
+            indices = [indices[position] for position in views_of_rank(sizes, world.num_ranks, world.rank)]
+        return list(dict.fromkeys(indices))
+
+    def close(self) -> None:
+        """End the threads that decode images; they start again if another view is drawn."""
+        if vars(self).get("prefetcher") is not None:
+            vars(self)["prefetcher"].close()
+
+    @cached_property
+    def cameras(self) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+        """World-to-camera matrices [4, 4] and intrinsics in px [3, 3] of all training views, made once.
+
+        In a step, nerfstudio's cameras would make the host wait. Raises InputError if undistorting an image failed.
+        """
+        dataset = self.datamanager.train_dataset
+        _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
+        cameras = dataset.cameras
+        device = self.model.device
+        check_undistortion(cameras, dataset.image_filenames)
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+        return viewmats.to(device).unbind(), cameras.get_intrinsics_matrices().to(device).unbind()
+
+    def viewmat(self, index: int) -> Tensor:
+        """World-to-camera matrix of a training view, corrected by the camera optimizer. [4, 4]"""
+        viewmats, _ = self.cameras
+        optimizer = self.model.camera_optimizer
+        if optimizer.config.mode == "off":
+            return viewmats[index]
+        camera = self.datamanager.train_cameras[index : index + 1].to(self.model.device)
+        camera.metadata = {"cam_idx": index}
+        return viewmats_from_camera_to_world(optimizer.apply_to_camera(camera))[0]
+
+    def stacked_cameras(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
+        _, every_K = self.cameras
+        viewmats = [self.viewmat(index) for index in indices]
+        Ks = [every_K[index] for index in indices]
+        n = len(indices)
+        if n == 1:
+            return viewmats[0][None], Ks[0][None]
+        # This takes one copy on the device instead of two; both results are contiguous, as gsplat wants them.
+        flat_viewmats, flat_Ks = torch.cat([matrix.flatten() for matrix in viewmats + Ks]).split([16 * n, 9 * n])
+        return flat_viewmats.view(n, 4, 4), flat_Ks.view(n, 3, 3).detach()

@@ -1,0 +1,1 @@
+"""What several test modules share: drawn and random scenes, short runs, processes, and stand-ins for gsplat."""

@@ -1,0 +1,117 @@
+"""Matches of features by a matrix product, beside a loop over all pairs of descriptors and beside COLMAP's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+
+@pytest.fixture(scope="module")
+def matching() -> ModuleType:
+    """The module is imported after Pillow, as in the command, where it has a process of its own."""
+    from sadgs_ns.placing import matching
+
+    return matching
+
+
+def random_descriptors(number: int, generator: np.random.Generator) -> np.ndarray:
+    values = generator.exponential(size=(number, 128))
+    return np.round(512 * np.sqrt(values / values.sum(axis=1, keepdims=True))).clip(0, 255).astype(np.uint8)
+
+
+def by_hand(one: np.ndarray, other: np.ndarray) -> set[tuple[int, int]]:
+    """Mutual matches, one descriptor after the other."""
+
+    def best(of: np.ndarray, among: np.ndarray) -> int:
+        angles = [np.arccos(min(float(of.astype(float) @ x.astype(float)) / 512**2, 1.0)) for x in among]
+        order = np.argsort(angles, kind="stable")
+        near = angles[order[0]] <= 0.7 and (len(order) == 1 or angles[order[0]] < 0.8 * angles[order[1]])
+        return int(order[0]) if near else -1
+
+    if not len(one) or not len(other):
+        return set()
+    return {(i, best(x, other)) for i, x in enumerate(one) if (j := best(x, other)) >= 0 and best(other[j], one) == i}
+
+
+@pytest.mark.parametrize(("number", "others"), [(40, 60), (1, 5), (7, 1), (0, 3), (3, 0)])
+def test_matches_are_those_of_a_loop_over_all_pairs(matching: ModuleType, number: int, others: int):
+    generator = np.random.default_rng(number)
+    one, other = random_descriptors(number, generator), random_descriptors(others, generator)
+    shared = min(number, others) // 2
+    noise = generator.integers(-3, 4, (shared, 128))
+    other[:shared] = (one[:shared].astype(int) + noise).clip(0, 255)
+    if shared > 3:
+        other[shared] = other[0]  # Two are as near as each other, so that neither is a match.
+    found = matching.match_descriptors(torch.from_numpy(one), torch.from_numpy(other))
+    assert found.shape[1] == 2 and {(i, j) for i, j in found.tolist()} == by_hand(one, other)
+    assert len(found) >= shared - 1
+
+
+def test_photos_are_paired_with_those_that_look_most_alike(matching: ModuleType):
+    """Of a ring of photos, each of which shares features with the next ones, and of another that shares none."""
+    generator = np.random.default_rng(0)
+    scene = random_descriptors(12 * 20, generator)
+    ring = [scene[(20 * i + np.arange(60)) % len(scene)] for i in range(12)]
+    photos = [*ring, random_descriptors(60, generator), scene[:0]]
+    pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 4)
+    near = {(i, j) for i in range(12) for j in range(i + 1, 12) if min(j - i, 12 + i - j) <= 2}
+    assert near <= {*pairs} and len(pairs) == len({*pairs}) <= 4 * len(photos)
+    assert all(i < j for i, j in pairs)
+
+
+def test_groups_of_photos_that_hardly_look_alike_are_joined(matching: ModuleType):
+    generator = np.random.default_rng(0)
+    one, other = random_descriptors(40, generator), random_descriptors(40, generator)
+    photos = [one] * 4 + [other] * 4
+    photos[2], photos[5] = np.r_[one, other[:1]], np.r_[other, other[:1]]
+    pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 3)
+    assert any(i < 4 <= j for i, j in pairs)
+    assert matching.similar_pairs([torch.zeros(0, 128, dtype=torch.uint8)] * 3, 1)  # as of photos without texture
+
+
+def parts_of_a_wall(folder: Path) -> list[str]:
+    """Write three overlapping photos of a blotchy wall; returns their names."""
+    wall = gaussian_filter(np.random.default_rng(0).normal(size=(400, 700)), 2.5)
+    wall = np.clip(127 + 60 * wall / wall.std(), 0, 255).astype(np.uint8)
+    folder.mkdir()
+    names = []
+    for i in range(3):
+        names.append(f"part {i}.png")
+        Image.fromarray(wall[20 * i : 20 * i + 320, 90 * i : 90 * i + 460]).save(folder / names[-1])
+    return names
+
+
+def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp_path: Path):
+    import pycolmap
+
+    from sadgs_ns.placing import features
+
+    names = parts_of_a_wall(tmp_path / "photos")
+    inliers = []
+    for ours in (False, True):
+        database = tmp_path / f"{ours}.db"
+        features.extract(tmp_path / "photos", [names], database)
+        pairs = [(names[0], names[1]), (names[0], names[2]), (names[1], names[2])]
+        if ours:
+            matching.write_matches(database, pairs, torch.device("cpu"), "matches")
+            matching.write_matches(database, pairs, torch.device("cpu"), "matches")  # There is nothing left to do.
+            pycolmap.geometric_verification(database)  # It takes names with spaces, as a list of pairs does not.
+        else:
+            pycolmap.match_exhaustive(database)
+        with pycolmap.Database.open(database) as opened:
+            ids = {image.name: image.image_id for image in opened.read_all_images()}
+            matches = opened.read_matches(ids[names[0]], ids[names[1]])
+            one, other = (torch.from_numpy(opened.read_descriptors(ids[name]).data.copy()) for name in names[:2])
+            same = {*map(tuple, matches.tolist())} == {*map(tuple, matching.match_descriptors(one, other).tolist())}
+            assert same or not ours, "COLMAP should verify what was matched, and match nothing itself"
+            geometries = [opened.read_two_view_geometry(ids[a], ids[b]) for a, b in pairs]
+        inliers.append([len(geometry.inlier_matches) for geometry in geometries])
+    colmaps, our = inliers
+    assert min(colmaps) > 50
+    assert our == pytest.approx(colmaps, rel=0.1)

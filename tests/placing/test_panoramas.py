@@ -1,0 +1,145 @@
+"""Panoramas of a drawn hall, from their views to the scene that these make."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+from collections import defaultdict
+from pathlib import Path
+
+import av
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+
+from helpers.drawn_photos import draw_panorama, draw_photo, draw_photos, panorama_centres
+from sadgs_ns.cli.process import Process, process
+from sadgs_ns.placing.panoramas import VIEWS, cut, is_panorama, rotations
+from sadgs_ns.placing.photos import read_photos
+from sadgs_ns.placing.reconstruct import choose_pairs
+
+COUNT, HEIGHT, TURN = 12, 256, 0.2
+
+
+@pytest.fixture(scope="module")
+def panoramas() -> list[Image.Image]:
+    """Panoramas of a camera that moves and turns."""
+    centres = panorama_centres(COUNT)
+    return [Image.fromarray(draw_panorama(centre, HEIGHT, TURN * i)) for i, centre in enumerate(centres)]
+
+
+def centres_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
+    """Where the panoramas of a model were taken, by their names, which all their views agree on."""
+    found: dict[str, list[np.ndarray]] = defaultdict(list)
+    for image in model.images.values():
+        if "/" in image.name:
+            found[image.name.partition("/")[0]].append(image.projection_center())
+    assert all(len(views) == VIEWS and np.ptp(views, axis=0).max() < 1e-9 for views in found.values())
+    return {name: views[0] for name, views in sorted(found.items())}
+
+
+def errors_of_centres(model: pycolmap.Reconstruction) -> np.ndarray:
+    """Distances of all panoramas from where they are, as shares of the largest from their centre. [COUNT]"""
+    found, expected = np.stack([*centres_of(model).values()]), panorama_centres(COUNT)
+    assert len(found) == COUNT
+    similarity = pycolmap.estimate_sim3d(found, expected)
+    assert similarity is not None
+    aligned = np.stack([similarity * centre for centre in found])
+    return np.linalg.norm(aligned - expected, axis=1) / np.linalg.norm(expected - expected.mean(0), axis=1).max()
+
+
+@pytest.mark.hard_case(
+    "360° panoramas (2:1, with or without GPano in XMP)",
+    'said to be such, and cut into a rig of eight pinhole views without tripod and zenith; before, "take more of them"',
+)
+@pytest.mark.hard_case(
+    "panoramas and ordinary photos in one folder, some added later",
+    "the panoramas alone are cut, poses that are there stay, and no panorama is divided between training and test",
+)
+def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image], tmp_path: Path, capsys):
+    source, out = tmp_path / "photos", tmp_path / "out"
+    source.mkdir()
+    for i, panorama in enumerate(panoramas):
+        panorama.save(source / f"{i:02d}.jpg", quality=95)
+    last = shutil.move(source / "11.jpg", tmp_path)
+    summary = process(Process(source, out, matching="sequential"))
+    assert (summary.photos, summary.registered) == (11 * VIEWS, 11 * VIEWS)
+    printed = capsys.readouterr().out
+    assert "11 of the 11 photos are panoramas: each is cut into 8 views of 90°" in printed
+    described = json.loads((out / "transforms.json").read_text())
+    assert described["val_filenames"] == described["test_filenames"] == [f"images/04.jpg/{i}.jpg" for i in range(VIEWS)]
+    assert len(described["train_filenames"]) == 10 * VIEWS and len(described["frames"]) == 11 * VIEWS
+    for frame in described["frames"]:
+        assert (frame["w"], frame["h"]) == (HEIGHT // 2, HEIGHT // 2)
+        assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [HEIGHT / 4] * 4
+    shutil.move(last, source)
+    middle = panorama_centres(COUNT)[3:9:5]
+    for name, centre, rotation in zip(("a.jpg", "b.jpg"), middle, rotations()[1:3], strict=True):
+        Image.fromarray(draw_photo(centre + 0.1, rotation, 256)).save(source / name, quality=95)
+    summary = process(Process(source, out, matching="exhaustive"))
+    assert (summary.photos, summary.registered) == (COUNT * VIEWS + 2, COUNT * VIEWS + 2)
+    assert "12 of the 14 photos are panoramas" in capsys.readouterr().out
+    grown = json.loads((out / "transforms.json").read_text())
+    frames = {frame["file_path"]: frame for frame in grown["frames"]}
+    assert all(frames[frame["file_path"]] == frame for frame in described["frames"])
+    assert grown["test_filenames"] == described["test_filenames"]
+    new = [f"images/11.jpg/{i}.jpg" for i in range(VIEWS)] + ["images/a.jpg", "images/b.jpg"]
+    assert grown["train_filenames"] == described["train_filenames"] + new
+    assert all((out / name).is_file() for name in frames)
+    assert errors_of_centres(pycolmap.Reconstruction(out / "sparse" / "0")).max() < 0.01
+
+
+@pytest.mark.hard_case(
+    "a 360° video", "its frames are cut like panoramas, and views that look the same way are matched"
+)
+def test_a_video_of_panoramas_becomes_views(panoramas: list[Image.Image], tmp_path: Path):
+    with av.open(str(tmp_path / "film.mp4"), "w") as film:
+        stream = film.add_stream("libx264", rate=10, options={"crf": "14"})
+        stream.width, stream.height, stream.pix_fmt = 2 * HEIGHT, HEIGHT, "yuv420p"
+        for panorama in panoramas:
+            film.mux(stream.encode(av.VideoFrame.from_image(panorama)))
+        film.mux(stream.encode())
+    summary = process(Process(tmp_path / "film.mp4", tmp_path / "out"))
+    assert summary.matching == "sequential" and summary.registered >= 0.9 * summary.photos == 0.9 * COUNT * VIEWS
+    assert errors_of_centres(pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")).max() < 0.01
+
+
+def test_views_are_those_of_a_pinhole_camera_across_the_seam(panoramas: list[Image.Image]):
+    centre = panorama_centres(COUNT)[0]
+    for view, rotation in zip(cut(panoramas[0]), rotations(), strict=True):
+        expected = draw_photo(centre, rotation, HEIGHT // 2).astype(float)
+        difference = np.abs(np.asarray(view) - expected).mean()
+        assert difference < 0.15 * np.abs(expected[::-1] - expected).mean()
+    up = rotations()[:, :, 2] @ [0, -1, 0]
+    assert np.degrees(np.arcsin(up)).max() + 45 < 68  # no pole
+
+
+def test_what_is_a_panorama(panoramas: list[Image.Image], tmp_path: Path):
+    photo = next(draw_photos()).resize((512, 384)).crop((0, 64, 512, 320))
+    eye = Image.fromarray(np.uint8(255 * (np.hypot(*np.mgrid[-127.5:128, -127.5:128]) < 120)))
+    pair = Image.new("RGB", (512, 256))  # of a camera's two fisheyes
+    for x in (0, 256):
+        pair.paste(panoramas[0].crop((x, 0, x + 256, 256)), (x, 0), eye)
+    wide = panoramas[0].crop((0, 100, 512, 156))
+    for image, expected in ((photo, False), (pair, False), (wide, False), *((each, True) for each in panoramas)):
+        assert is_panorama(image, image.size) == expected
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    photo.save(tmp_path / "told.jpg", xmp=xmp)
+    wide.save(tmp_path / "wide.jpg", xmp=xmp)
+    for i, panorama in enumerate(panoramas):
+        panorama.resize((1024, 512)).save(tmp_path / f"{i}.jpg", quality=80)
+        assert read_photos(tmp_path, [f"{i}.jpg"], lambda *step: None)[0].is_panorama
+    told, part = read_photos(tmp_path, ["told.jpg", "wide.jpg"], lambda *step: None)
+    assert told.is_panorama and not part.is_panorama
+
+
+def test_views_are_paired_with_those_of_other_panoramas():
+    rigs = [[f"{i}.jpg/{view}.jpg" for view in range(VIEWS)] for i in range(20)]
+    names = ["a.jpg", *itertools.chain(*rigs)]
+    every = choose_pairs(names, rigs, "exhaustive")
+    assert len(every) == 190 * VIEWS**2 + 20 * VIEWS and all(a.split("/")[0] != b.split("/")[0] for a, b in every)
+    some = choose_pairs(names, rigs, "sequential")
+    assert ("0.jpg/0.jpg", "2.jpg/0.jpg") in some and ("0.jpg/0.jpg", "1.jpg/4.jpg") in some
+    assert ("0.jpg/0.jpg", "1.jpg/2.jpg") not in some and ("19.jpg/7.jpg", "a.jpg") in some and len(some) < 16 * 160

@@ -1,0 +1,188 @@
+"""What nerfstudio's other commands, such as `ns-eval` and `ns-render`, say of a run where they cannot go on.
+
+Tried by hand: `ns-*` commands in a deleted working directory end with "Intel oneMKL FATAL ERROR", because MKL ends the
+process as nerfstudio imports torch, before any code of ours.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+from nerfstudio.scripts.eval import ComputePSNR
+from nerfstudio.scripts.render import DatasetRender, RenderInterpolated, SpiralRender
+from nerfstudio.utils import install_checks, writer
+
+from helpers.forked_python import HANGS
+from helpers.kill_and_resume import configure
+from helpers.short_runs import train
+from sadgs_ns import errors
+from sadgs_ns.errors import InputError
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.run.run_folder import write_config
+
+HELD_OUT = {0: 1.0, 1: 0.9}
+"""Number of held-out views, and the share of the drawn scene's 10 views that is then trained on."""
+
+
+@pytest.fixture(scope="module", params=HELD_OUT)
+def run(request: pytest.FixtureRequest, scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[int, Path]:
+    """Number of held-out views, and the config.yml of a run that holds out so many."""
+    config = configure(scene, tmp_path_factory.mktemp("run"), iterations=1, save_every=0)
+    parser: Any = config.pipeline.datamanager.dataparser
+    config.pipeline.datamanager.dataparser = dataclasses.replace(
+        parser, eval_mode="fraction", train_split_fraction=HELD_OUT[request.param]
+    )
+    return request.param, write_config(train(config).config)
+
+
+@pytest.fixture(autouse=True)
+def no_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(install_checks, "check_ffmpeg_installed", lambda: None)
+    monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))  # its weights would be downloaded
+
+
+def said_of(command: Any) -> str | None:
+    """What is printed in place of the traceback."""
+    with pytest.raises((ValueError, OSError, AssertionError, AttributeError, RuntimeError, EOFError)) as failed:
+        command.main()
+    return errors.sentence_of(failed.value)
+
+
+@pytest.mark.hard_case("`ns-eval` with one held-out view; with none", "no deviations; refused")
+def test_one_held_out_view_has_no_deviation_and_none_is_one_sentence(run: tuple[int, Path], tmp_path: Path):
+    held_out, config = run
+    command = ComputePSNR(config, tmp_path / "results.json")
+    if held_out == 0:
+        with pytest.raises(InputError, match=r"^The run holds out no view, so that there is nothing to measure: train"):
+            command.main()
+        return
+    command.main()
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    results = json.loads((tmp_path / "results.json").read_text(), parse_constant=refuse)["results"]
+    assert {"psnr", "ssim", "fps"} <= results.keys() and not any(name.endswith("_std") for name in results)
+
+
+@pytest.mark.hard_case(
+    "`ns-render interpolate` with one held-out view, or none; `spiral`; `dataset` without a held-out view",
+    "one sentence: `--pose-source train`, or what to use instead",
+)
+def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Path], tmp_path: Path):
+    held_out, config = run
+    said = said_of(RenderInterpolated(config, tmp_path / "video.mp4"))
+    assert said is not None and said.startswith("A path between views needs two of them, and the run holds out fewer: ")
+    said = said_of(SpiralRender(config, tmp_path / "video.mp4"))
+    assert said is not None and said.startswith("`ns-render spiral` does not work with methods that train on whole ")
+    if held_out == 0:
+        said = said_of(DatasetRender(load_config=config, output_path=tmp_path / "views"))
+        assert said == (
+            "The run holds out no view that could be rendered: add --split train, which takes the training views."
+        )
+
+
+@pytest.mark.hard_case(
+    "`ns-export pointcloud`, `poisson`, `tsdf` and `marching-cubes`; `cameras` of a COLMAP capture",
+    "one sentence, which names `sadgs-export … .mesh.ply`, where a traceback was; the cameras' poses",
+)
+@pytest.mark.usefixtures("open3d")
+@pytest.mark.parametrize("run", [1], indirect=True)
+def test_exports_of_fields_name_the_one_of_splats(run: tuple[int, Path], tmp_path: Path):
+    from nerfstudio.scripts import exporter
+
+    for command in (
+        exporter.ExportPointCloud(run[1], tmp_path),
+        exporter.ExportPointCloud(run[1], tmp_path, normal_method="open3d"),
+        exporter.ExportPoissonMesh(run[1], tmp_path),
+        exporter.ExportTSDFMesh(run[1], tmp_path),
+        exporter.ExportMarchingCubesMesh(run[1], tmp_path),
+    ):
+        said = said_of(command)
+        assert said is not None and "`sadgs-export RUN --output room.mesh.ply` writes a mesh" in said, command
+    exporter.ExportCameraPoses(run[1], tmp_path).main()
+    counts = [len(json.loads((tmp_path / f"transforms_{part}.json").read_text())) for part in ("train", "eval")]
+    assert counts == [9, 1]
+
+
+@pytest.mark.hard_case(
+    "`ns-eval` or `ns-render` with a config.yml that is missing or none; `ns-eval --output-path x.txt`", "one sentence"
+)
+def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp_path: Path):
+    none = tmp_path / "none.yml"
+    said = said_of(ComputePSNR(none))
+    assert said is not None
+    assert said.startswith(f"{none} cannot be read (No such file or directory): give --load-config the config.yml of a")
+    none.write_text("hello")
+    assert said_of(ComputePSNR(none)) == "The file that --load-config names is no config.yml of a run: give it one."
+    assert said_of(ComputePSNR(run[1], tmp_path / "results.txt")) == (
+        "--output-path must end with .json: give the file of results another name."
+    )
+
+
+@pytest.mark.hard_case(
+    "`ns-eval`, `ns-render` or `ns-viewer` of a run whose latest checkpoint is cut off", "one sentence"
+)
+@pytest.mark.parametrize("size", [0, 5000, 20_000])
+def test_a_damaged_checkpoint_is_named(size: int, run: tuple[int, Path]):
+    (checkpoint,) = run[1].parent.glob("nerfstudio_models/*.ckpt")
+    damaged = checkpoint.with_name("step-000000009.ckpt")
+    damaged.write_bytes(checkpoint.read_bytes()[:size])
+    said = said_of(ComputePSNR(run[1]))
+    damaged.unlink()
+    assert said is not None and said.startswith("The latest checkpoint in the run's folder nerfstudio_models cannot be")
+
+
+@pytest.mark.hard_case("`--vis wandb` or `--vis comet` without a login", "one sentence")
+def test_a_logger_that_cannot_start_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def init(**options: Any) -> None:
+        raise RuntimeError("No API key configured.")
+
+    monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
+    with pytest.raises(RuntimeError) as failed:
+        writer.setup_event_writer(True, False, False, log_dir=tmp_path, experiment_name="test")
+    assert errors.sentence_of(failed.value) == (
+        "The logger that --vis names could not start (No API key configured): log in to its service, or choose another "
+        "--vis."
+    )
+
+
+def test_errors_that_are_nobody_s_keep_their_traceback():
+    with pytest.raises(ValueError) as failed:
+        int("seven")
+    assert errors.sentence_of(failed.value) is None
+
+
+@pytest.mark.hard_case("a deleted working directory, our commands", "one sentence")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows deletes no folder that a process works in")
+def test_a_deleted_working_directory_is_named_before_torch_ends_the_process(tmp_path: Path):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    code = f"import os; os.chdir({str(gone)!r}); os.rmdir({str(gone)!r}); import sadgs_ns.cli.doctor"
+    path = {"PYTHONPATH": os.pathsep.join(sys.path)}
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=HANGS,
+        env={**os.environ, **path},
+    )
+    said = "error: The working directory was deleted: change to a folder that exists with `cd`.\n"
+    assert (result.returncode, result.stderr) == (1, said)
+
+
+@pytest.mark.hard_case("the working directory is deleted while a run saves, and the disk is full there", "one sentence")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows deletes no folder that a process works in")
+def test_free_space_is_told_in_a_deleted_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert errors.free_space(Path("outputs/scene")).endswith(" GB")
