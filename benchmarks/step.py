@@ -19,9 +19,9 @@ from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
 from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.screen_gradients import accumulate_gradients, keep_gradient
 from sadgs_ns.method.statistics import observe
-from sadgs_ns.method.strategy import empty_state
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam

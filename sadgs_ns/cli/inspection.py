@@ -136,12 +136,13 @@ def _try(model: SadgsModel, state: dict[str, Any], densify: Callable[[Any, Any, 
 def structure_step(model: SadgsModel, statistics: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a structure-aware step without its pruning, as `_try`."""
     counts = model.strategy.planned_children(model.gauss_params, statistics)
-    return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.child_scale))
+    return _try(model, {}, partial(grid_split, counts=counts, child_scale=model.strategy.options.child_scale))
 
 
 def conventional_step(model: SadgsModel, gradients: dict[str, Tensor]) -> dict[str, Tensor]:
     """Return the Gaussians after a step of AbsGS, clones and splits in two, without its pruning, as `_try`."""
-    strategy = replace(model.strategy, absgs_long_axis=False)
+    options = replace(model.plan.strategy, absgs_long_axis=False)
+    strategy = options.for_run(model.plan.iterations)
     state = {**gradients, "scene_scale": model.strategy_state["scene_scale"]}
     densify = partial(apply, *strategy.planned_growth(absgs, model.gauss_params, state))
     with torch.random.fork_rng(devices=[model.device] if model.device.type == "cuda" else []):

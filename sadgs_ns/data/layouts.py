@@ -38,64 +38,87 @@ class ParserOptions:
             raise InputError(f"downscale-factor must be at least 1, got {self.downscale_factor}.")
 
 
-def find_reconstructions(data: Path) -> dict[Path, list[str]]:
-    """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
-
-    The first is the one to read: one in a usual place, or else the one with the most images. A reconstruction right in
-    the data's folder counts if there is no other and its images are at hand. One that cannot be read has no names.
-    """
-    found: dict[Path, list[str]] = {folder: [] for folder in _model_folders(data)}
-    for folder in found:
-        with contextlib.suppress(InputError):
-            found[folder] = colmap.image_names(data / folder)
-    return dict(sorted(found.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + len(item[1]))))
-
-
-def _model_folders(data: Path) -> list[Path]:
-    numbered = [path for place in ("colmap/sparse", "sparse") for path in sorted((data / place).glob("[0-9]*"))]
-    folders = (*map(Path, COLMAP_FOLDERS), Path("images"), *(path.relative_to(data) for path in numbered))
-    if found := [folder for folder in folders if colmap.model_kind(data / folder)]:
-        return found
-    kind = colmap.model_kind(data)
-    is_whole = kind and (data / f"images.{kind}").is_file()
-    return [Path()] if is_whole and images_folder(data, Path(), colmap.image_names(data)) is not None else []
-
-
-def transforms_path(data: Path) -> Path:
-    """Return the file of a capture whose path is that of a JSON file, or of a folder with a `transforms.json`."""
-    if data.suffix == ".json":
-        return data
-    return data / "transforms.json"
-
-
-def find_cameras(data: Path) -> Path | None:
-    """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
-    files = [transforms_path(data), data / "transforms_train.json"]
-    if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
-        model = next(iter(models))
-        files = [data / model / f"images.{colmap.model_kind(data / model)}"]
-    return next((file for file in files if file.is_file()), None)
-
-
-def images_folder(data: Path, model: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder that has images of a reconstruction by their names, both relative to the data, or None."""
-    others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
-    beside = [folder / "images" for folder in (model, *model.parents)]
-    folders = map(Path, ("images", "", model, *beside, *sorted(others)))
-    return next((folder for folder in folders if any(os.path.isfile(data / folder / name) for name in names)), None)
-
-
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
     """Return the layout of a capture's folder or file; None if it is unknown."""
     if data.is_file() or (data / "transforms.json").is_file():
         return "nerfstudio"
     if (data / "transforms_train.json").is_file():
         return "blender"
-    return "colmap" if _model_folders(data) else None
+    if _model_folders(data):
+        return "colmap"
+    return None
+
+
+def transforms_path(data: Path) -> Path:
+    """Return the JSON file of a capture, which is given as that file, or as a folder with a `transforms.json`."""
+    if data.suffix == ".json":
+        return data
+    return data / "transforms.json"
+
+
+def find_reconstructions(data: Path) -> dict[Path, list[str]]:
+    """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
+
+    The first is the one to read: one in a usual place, or else the one with the most images. A reconstruction directly
+    in the data's folder counts if there is no other and its images are there. One that cannot be read has no names.
+    """
+    models: dict[Path, list[str]] = {}
+    for folder in _model_folders(data):
+        models[folder] = []
+        with contextlib.suppress(InputError):
+            models[folder] = colmap.image_names(data / folder)
+
+    def order(folder: Path) -> tuple[bool, int]:
+        if str(folder) in COLMAP_FOLDERS:
+            return False, 0
+        return True, -len(models[folder])
+
+    return {folder: models[folder] for folder in sorted(models, key=order)}
+
+
+def _model_folders(data: Path) -> list[Path]:
+    """Return the folders of a capture that have a file of COLMAP's cameras, the usual ones first."""
+    folders = [Path(name) for name in (*COLMAP_FOLDERS, "images")]
+    for parent in ("colmap/sparse", "sparse"):
+        folders += [path.relative_to(data) for path in sorted((data / parent).glob("[0-9]*"))]
+    models = [folder for folder in dict.fromkeys(folders) if colmap.model_kind(data / folder)]
+    if models:
+        return models
+    kind = colmap.model_kind(data)
+    if kind is None or not (data / f"images.{kind}").is_file():
+        return []
+    if images_folder(data, Path(), colmap.image_names(data)) is None:
+        return []
+    return [Path()]
+
+
+def find_cameras(data: Path) -> Path | None:
+    """Return the file with the poses of a folder or JSON file, or None; raises as `colmap.read_poses`."""
+    for path in (transforms_path(data), data / "transforms_train.json"):
+        if path.is_file():
+            return path
+    models = find_reconstructions(data)
+    if not models:
+        return None
+    model = data / next(iter(models))
+    poses = model / f"images.{colmap.model_kind(model)}"
+    if not poses.is_file():
+        return None
+    return poses
+
+
+def images_folder(data: Path, model: Path, names: Sequence[str]) -> Path | None:
+    """Return the folder that has images of a reconstruction by their names, both relative to the data, or None."""
+    beside = [folder / "images" for folder in (model, *model.parents)]
+    others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
+    for folder in map(Path, ("images", "", model, *beside, *sorted(others))):
+        if any(os.path.isfile(data / folder / name) for name in names):
+            return folder
+    return None
 
 
 def automatic_options(data: Path) -> ParserOptions:
-    """Return how a folder's reconstruction, which it must have, is read where no parser is named.
+    """Return the options with which a folder's reconstruction is read if no parser is named; it must have one.
 
     Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
     that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
@@ -103,11 +126,16 @@ def automatic_options(data: Path) -> ParserOptions:
     model, names = next(iter(find_reconstructions(data).items()))
     folder = images_folder(data, model, names) or Path("images")
     options = ParserOptions(images_path=folder, colmap_path=model, downscale_factor=1, eval_mode="interval")
-    if not names or folder == Path():  # The smaller copies of images right in the capture would lie outside of it.
+    # The smaller copies of images directly in the capture's folder would lie outside of it.
+    if not names or folder == Path():
         return options
-    image, copies = data / folder / names[0], lambda by: images.smaller_folder(data / folder, by) / names[0]
-    factor = images.automatic_factor(image, copies)
-    rounding = images.rounding_of(image, copies(factor), factor)
+
+    def copy_of(factor: int) -> Path:
+        return images.smaller_folder(data / folder, factor) / names[0]
+
+    first = data / folder / names[0]
+    factor = images.automatic_factor(first, copy_of)
+    rounding = images.rounding_of(first, copy_of(factor), factor)
     return dataclasses.replace(options, downscale_factor=factor, downscale_rounding_mode=rounding)
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +21,23 @@ from sadgs_ns.method.statistics import consistent
 SMALL_SCALE = 0.001
 """Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
 _OTHER_AXES = 0.8  # Factor on the other axes of a Gaussian whose longest axis is halved (docs/results.md)
+
+
+class Options(Protocol):
+    """The options that rules and the running strategy read; `StructureAwareStrategy` has and documents them."""
+
+    max_gaussians: int
+    tau_split: float
+    min_observations: int
+    split_min_opacity: float
+    child_scale: float
+    clone_grad2d: float
+    split_absgrad2d: float
+    absgs_long_axis: bool
+    min_opacity: float
+
+    def check(self) -> None:
+        """Raise ValueError if an option is out of its range."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +60,8 @@ class Proposal:
         return growth if self.clone is None else growth + self.clone
 
 
-Propose = Callable[[Any, Params, Mapping[str, Any]], Proposal]
-"""Takes a `StructureAwareStrategy`, for its options, the parameters and the strategy's state."""
+Propose = Callable[[Options, Params, Mapping[str, Any]], Proposal]
+"""Takes the options, the parameters and the strategy's state."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +76,7 @@ class Rule:
     prunes by them before it grows, and empties the gradients, too; others prune the faint afterwards."""
 
 
-def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Split the axes on which η violated consistently, those of the largest η first (paper, section 3.5)."""
     violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)
     violates &= (opacities(params) >= options.split_min_opacity)[:, None]
@@ -68,7 +85,7 @@ def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> P
     return Proposal(counts, worst, partial(grid_split, child_scale=options.child_scale))
 
 
-def absgs(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
     The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of

@@ -22,7 +22,8 @@ from sadgs_ns.geometry.camera_paths import CameraPaths
 from sadgs_ns.geometry.initialization import camera_extent, neighbour_scales
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.running_strategy import RunningStrategy
+from sadgs_ns.method.strategy import DEFAULT_ITERATIONS
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.normals import normals_map
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
@@ -48,7 +49,7 @@ class SadgsModel(SplatfactoModel):
     """The Gaussians, their rendering and their loss; nerfstudio's other programs see a splatfacto model."""
 
     config: SadgsModelConfig
-    strategy: StructureAwareStrategy
+    strategy: RunningStrategy
     plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
 
@@ -56,7 +57,7 @@ class SadgsModel(SplatfactoModel):
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
         config = self.config
         config.check()
-        self.strategy = config.strategy
+        self.strategy = config.strategy.for_run(DEFAULT_ITERATIONS)  # Until `follow` sets that of the run.
         self.strategy_state = self.strategy.initialize_state()
         params, self.synthetic = initial_gaussians(config, self.seed_points)
         """Tell which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]"""
@@ -94,7 +95,7 @@ class SadgsModel(SplatfactoModel):
 
         Means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], which neighbours also limit.
         """
-        room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
+        room = max(min(len(means), self.strategy.options.max_gaussians - self.num_points), 0)
         if not room:
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]

@@ -19,8 +19,8 @@ from nerfstudio.viewer.viewer_elements import ViewerButton, ViewerControl, Viewe
 from torch import Tensor
 
 from sadgs_ns.errors import reason
+from sadgs_ns.method.growth import Options
 from sadgs_ns.method.quantization import dequantize
-from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
@@ -49,7 +49,7 @@ def changed(plan: AnyPlan, name: str, value: float) -> AnyPlan:
     return replace(plan, strategy=replace(plan.strategy, **option))
 
 
-def describe(strategy: StructureAwareStrategy, num_points: int, state: dict[str, Any]) -> str:
+def describe(strategy: Options, num_points: int, state: dict[str, Any]) -> str:
     """Return Markdown of the number of Gaussians, and of how structure steps, AbsGS and pruning changed it."""
     lines = [f"**{num_points:,} Gaussians** (cap {strategy.max_gaussians:,})", ""]
     steps = state.get("structure_steps", [])[-ROWS:]
@@ -92,7 +92,7 @@ class StructurePanel(torch.nn.Module):
         self.choice = ViewerDropdown("Show", OFF, CHOICES, cb_hook=lambda _: self._call(self.choose), hint=hint)
         self.legend = ViewerMarkdown("legend", lambda: self._legend)
         self.observe = ViewerButton("Observe all training views", cb_hook=lambda _: self._call(self.observe_now))
-        strategy, hint, hook = self._model.strategy, "Hard cap, from the next densification on", self._change
+        strategy, hint, hook = self._model.strategy.options, "Hard cap, from the next densification on", self._change
         self.set_max_gaussians = ViewerNumber("max_gaussians", strategy.max_gaussians, cb_hook=hook, hint=hint)
         hint, (low, high) = "Share of observations that must violate, at the next structure step", RANGES["tau_split"]
         self.set_tau_split = ViewerSlider("tau_split", strategy.tau_split, low, high, 0.05, cb_hook=hook, hint=hint)
@@ -106,7 +106,7 @@ class StructurePanel(torch.nn.Module):
 
     def _describe(self) -> str:
         model = self._model
-        text = describe(model.strategy, model.num_points, model.strategy_state)
+        text = describe(model.strategy.options, model.num_points, model.strategy_state)
         return f"{self._status}\n\n{text}" if self._status else text
 
     def _say(self, status: str) -> None:

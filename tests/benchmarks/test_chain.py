@@ -58,6 +58,11 @@ def test_a_table_compares_views_that_registered_in_all_rows():
     assert old.endswith("| b |") and new.endswith("| b |")
 
 
+def test_the_protocol_names_eight_captures():
+    protocol = chain.load(Path(chain.__file__).parents[1] / "configs/bench/chain.yaml")
+    assert len(protocol.captures) == 8 and protocol.seeds == [0, 1, 2] and protocol.max_size == 1600
+
+
 def test_a_protocol_that_is_none_is_refused(tmp_path: Path):
     file = tmp_path / "chain.yaml"
     with pytest.raises(ValueError, match="cannot be read"):

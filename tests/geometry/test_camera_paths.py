@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.geometry.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
 
 NEAR = 2.0
 """The near plane: space is empty up to 3 from the paths."""

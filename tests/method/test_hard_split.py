@@ -34,7 +34,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import absgs
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.split import children_per_axis

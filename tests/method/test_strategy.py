@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from gsplat.strategy.base import Strategy
 
 from helpers.small_scenes import adam, camera, random_params, training_step
-from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
@@ -84,6 +85,17 @@ def test_drops_into_a_plain_gsplat_loop(per_axis_radii: bool, views: int):
     _, state, counts = train(short(max_gaussians=3000), 22, per_axis_radii=per_axis_radii, views=views)
     assert counts[-1] > 120, "a fine checker under coarse Gaussians must be split"
     assert {"n_high", "n_low", "eta_max", "n_total", "grad2d", "absgrad2d", "grad_count"} <= set(state)
+
+
+def test_options_densify_as_the_strategy_that_is_made_of_them():
+    options = short(max_gaussians=3000)
+    strategy = options.for_run(3000)
+    assert isinstance(options, Strategy) and isinstance(strategy, Strategy)
+    params, state, counts = train(options, 26)
+    same_params, same_state, same_counts = train(options, 26, strategy=strategy)
+    assert counts == same_counts and state == same_state
+    for name, parameter in params.items():
+        assert torch.equal(parameter, same_params[name])
 
 
 def test_structure_step_splits_in_one_step_and_forgets_the_parents():

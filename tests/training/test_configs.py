@@ -46,7 +46,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
-NO_OPTIONS = {"_fitted", "world"}
+NO_OPTIONS = {"windows", "world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (

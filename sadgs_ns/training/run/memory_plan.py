@@ -12,7 +12,8 @@ from sadgs_ns import host_memory
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.ops import Params
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import step_memory as memory
 from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.training.run.processes import least, number_of_processes, processes_on_this_machine

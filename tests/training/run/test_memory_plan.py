@@ -28,8 +28,9 @@ from helpers.kill_and_resume import configure, set_up
 from sadgs_ns import host_memory
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.method import strategy as strategy_module
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method import running_strategy as strategy_module
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render import step_memory
 from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.training.run.memory_plan import (
