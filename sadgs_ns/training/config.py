@@ -32,7 +32,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.render.rasterization import choose_backend
 from sadgs_ns.render.types import BackendName
-from sadgs_ns.training.options import check_ranges, hide
+from sadgs_ns.training.options import check_ranges, fill_missing, hide
 from sadgs_ns.training.run import processes
 from sadgs_ns.training.run.progress import ProgressTable
 from sadgs_ns.training.run.run_folder import begin
@@ -313,6 +313,11 @@ class SadgsTrainerConfig(TrainerConfig):
             problem = f"With --load-config all options come from its file, and {', '.join(lost)} would be ignored"
             remedy = "leave these out, change them in the file, or give --load-dir with the run's folder instead"
             raise InputError(f"{problem}: {remedy}.")
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the values of a `config.yml` or a copy; options that an earlier version did not have get defaults."""
+        vars(self).update(state)
+        fill_missing(self)
 
     def print_to_terminal(self) -> None:
         """Print nothing. nerfstudio prints all options, which `config.yml` holds, before a run is known to start."""

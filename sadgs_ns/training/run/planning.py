@@ -49,7 +49,7 @@ def decide_near_plane(pipeline: SadgsPipeline, before: RunPlan | None) -> float:
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide iterations and views a step: by options, by an equal effort's plan `before`, or by rule."""
     effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
-    if before is not None and before.requested["effort"] == effort:
+    if before is not None and before.requested.get("effort", effort) == effort:
         iterations = before.iterations if iterations is None else iterations
         in_step = before.views_per_iteration if in_step is None else in_step
     return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
