@@ -84,7 +84,8 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Return a checkpoint after `change` was applied to its tensors [N, …] of Gaussians, in a fixed order."""
-    pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
+    pipeline = dict(state["pipeline"])
+    optimizers = dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
     pipeline |= {name: change(pipeline[name]) for name in names}
     for name in sorted(key for name in names if (key := name.rpartition(".")[2]) in optimizers):
@@ -92,7 +93,8 @@ def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[
         optimizers[name] = {**optimizers[name], "state": moments}
     if "_model._extra_state" in pipeline:
         extra = pipeline["_model._extra_state"]
-        statistics, average = _rows(extra["strategy_state"], change), extra["average"]
+        statistics = _rows(extra["strategy_state"], change)
+        average = extra["average"]
         average = {**average, "means": _rows(average["means"], change)}
         pipeline["_model._extra_state"] = {**extra, "strategy_state": statistics, "average": average}
     return {**state, "pipeline": pipeline, "optimizers": optimizers}

@@ -93,7 +93,8 @@ def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions
     cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
     """
     dataset = pipeline.datamanager.train_dataset
-    now, positions = [path.name for path in dataset.image_filenames], camera_positions(dataset.cameras)
+    now = [path.name for path in dataset.image_filenames]
+    positions = camera_positions(dataset.cameras)
     distances, _ = KDTree(positions).query(positions_before)  # [C]
     same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
     if 2 * same < min(len(before), len(now)):

@@ -62,7 +62,8 @@ def _check_folder(config: TrainerConfig) -> None:
 
 def _check_address(viewer: ViewerConfig) -> None:
     """Raise InputError if the viewer cannot listen at its address; viser would take another port, or never return."""
-    host, port = viewer.websocket_host, viewer.websocket_port
+    host = viewer.websocket_host
+    port = viewer.websocket_port
     try:
         places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, _, _, _, address in places:

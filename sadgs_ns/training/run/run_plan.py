@@ -74,7 +74,8 @@ class RunPlan:
         """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
         planned = {}
         for name, rate in self.rates.items():
-            group, decay = configs[name], asdict(rate)
+            group = configs[name]
+            decay = asdict(rate)
             optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
             ours = decay["max_steps"] is not None
             scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")
@@ -121,7 +122,8 @@ def plan_rates(
     """
     rates = {}
     for name, group in configs.items():
-        lr, decay = group["optimizer"].lr, group.get("scheduler")
+        lr = group["optimizer"].lr
+        decay = group.get("scheduler")
         factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
         start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)
         lr *= start

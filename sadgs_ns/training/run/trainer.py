@@ -123,7 +123,8 @@ class SadgsTrainer(Trainer):
 
     def setup_optimizers(self) -> SadgsOptimizers:
         """Prepare the run, as `prepare_run` says, and build its optimizers."""
-        config, pipeline = self.config, self.pipeline
+        config = self.config
+        pipeline = self.pipeline
         run = prepare_run(config, pipeline, self.world, self._peers)
         self.world = run.world
         self._peers = run.peers
@@ -193,10 +194,13 @@ class SadgsTrainer(Trainer):
         # Several processes agree in the step what to do after it.
         self.world.flags_in = 0
         self.world.flags_out = self._own_requests().encode()
-        pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
+        pipeline = self.pipeline
+        model = self.pipeline.model
+        graphed = self.graphed
         if graphed is not None and model.tile_forecast is not None:
             model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
-        groups, update = pipeline.next_views(step), self.optimizers.update()
+        groups = pipeline.next_views(step)
+        update = self.optimizers.update()
         inputs = groups, model.opacity_reg_now, update
         factors = update.factors()
         nonfinite_flag = pipeline.log.nonfinite_flag
@@ -273,7 +277,9 @@ class SadgsTrainer(Trainer):
             # With --load-config nerfstudio takes all options from this file.
             config = copy.copy(self.config)
             config.max_num_iterations = total
-            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
+            config.load_dir = self.checkpoint_dir
+            config.load_step = None
+            config.load_checkpoint = None
             config.vis = self._vis
             file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
             command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
