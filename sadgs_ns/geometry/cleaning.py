@@ -88,6 +88,50 @@ def measure_visibility(
     return Visibility(views, pixels, number)
 
 
+@dataclass(frozen=True)
+class Remaining:
+    """The Gaussians that a cleaning leaves of N."""
+
+    stays: Tensor  # Which Gaussians stay. bool [N]
+    num_removed: dict[str, int]
+    """How many each option that is set takes of what those before it left, by the names of `Cleaning`'s fields."""
+    num_views: int  # Number of training views that were asked; 0 if none had to be
+
+
+@torch.no_grad()
+def choose_remaining(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None) -> Remaining:
+    """Find which Gaussians stay, one option of the cleaning after the other.
+
+    Args:
+        params: `means` and log `scales`.
+        cleaning: What is taken away.
+        seen: What training views see of the Gaussians. It is needed if `cleaning.needs_views`.
+    """
+    means = params["means"].detach()
+    extents = params["scales"].detach().amax(dim=1).exp()  # Longest standard deviations. [N]
+    goes: dict[str, Tensor] = {}  # What each option would take of all Gaussians, in the order of the options
+    if cleaning.crop is not None:
+        low, high = means.new_tensor(cleaning.crop).view(2, 3)
+        is_inside = (means >= low) & (means <= high)  # [N, 3]
+        goes["crop"] = ~is_inside.all(dim=1)
+    if cleaning.max_extent is not None:
+        goes["max_extent"] = extents > cleaning.max_extent
+    num_views = 0
+    if cleaning.needs_views:
+        assert seen is not None
+        num_views = seen.total
+        if cleaning.min_views > 0:
+            goes["min_views"] = seen.views < cleaning.min_views
+        if cleaning.dust > 0:
+            goes["dust"] = seen.pixels < cleaning.dust
+    stays = torch.ones(len(means), dtype=torch.bool, device=means.device)
+    num_removed = {}
+    for option, taken in goes.items():
+        num_removed[option] = int((stays & taken).sum())
+        stays &= ~taken
+    return Remaining(stays, num_removed, num_views)
+
+
 @torch.no_grad()
 def find_remaining(
     params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None
