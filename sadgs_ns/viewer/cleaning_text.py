@@ -23,10 +23,8 @@ def check_options(cleaning: Cleaning) -> None:
 
 def _is_box(crop: tuple[float, ...]) -> bool:
     """Tell whether all corners are finite, and the lowest one is below the highest one on each axis."""
-    for low, high in zip(crop[:3], crop[3:], strict=True):
-        if not -math.inf < low < high < math.inf:
-            return False
-    return True
+    corners = zip(crop[:3], crop[3:], strict=True)
+    return all(-math.inf < low < high < math.inf for low, high in corners)
 
 
 def removal_sentences(cleaning: Cleaning, remaining: Remaining) -> list[str]:
