@@ -89,7 +89,8 @@ def import_nerfstudio() -> None:
         StandIn.importing = False
     from nerfstudio.utils import tensor_dataclass
 
-    tensor_dataclass.torch = TorchForCameras("torch")  # Only this module sees it; torch itself stays as it is.
+    # Only this module sees it; torch itself stays as it is.
+    tensor_dataclass.torch = TorchForCameras("torch")  # pyright: ignore[reportPrivateImportUsage]
 
 
 def _import_with_stand_ins(importer: str, names: Sequence[str]) -> None:
