@@ -22,7 +22,7 @@ def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     beside another path where the folder of `path`, which is made if there is none, must hold no other files. Raise
     WriteError if the disk is full or the folder cannot be written.
     """
-    neighbour = path if beside is None else beside
+    neighbour = beside or path
     partial = neighbour.with_name(f".{neighbour.stem}.partial{neighbour.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -37,8 +37,10 @@ def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
 
 def read_settings(file: Path, folder: Path) -> dict[str, Any]:
     """Return the settings of a folder, none if their file does not exist; raise InputError if it is damaged."""
+    if not file.exists():
+        return {}
     try:
-        return dict(json.loads(file.read_text("utf8"))) if file.exists() else {}
+        return dict(json.loads(file.read_text("utf8")))
     except ValueError as error:
         raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
 
@@ -55,16 +57,22 @@ def locked(folder: Path, refusal: str, seconds: float = 0.0) -> Iterator[int]:
 
     Raise InputError with the message `refusal` if the folder does not become free in these seconds.
     """
-    lock, end = os.open(folder, os.O_RDONLY), time.monotonic() + seconds
+    lock = os.open(folder, os.O_RDONLY)
     try:
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError as error:
-                if time.monotonic() > end:
-                    raise InputError(refusal) from error
-                time.sleep(0.2)
+        end = time.monotonic() + seconds
+        while not _takes(lock):
+            if time.monotonic() > end:
+                raise InputError(refusal)
+            time.sleep(0.2)
         yield lock
     finally:
         os.close(lock)
+
+
+def _takes(lock: int) -> bool:
+    """Take the lock of an open folder, and return whether it was free."""
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

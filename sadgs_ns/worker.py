@@ -42,7 +42,8 @@ class WorkerError(RunError):
 
     def __init__(self, sentence: str, exitcode: int, output: str) -> None:
         super().__init__(sentence)
-        self.exitcode, self.output = exitcode, output
+        self.exitcode = exitcode
+        self.output = output
 
 
 class Worker:
@@ -59,7 +60,9 @@ class Worker:
     """
 
     def __init__(self, function: str, log: Path, keep_open: Sequence[int] = (), saves: bool = False) -> None:
-        self.log, self._events, self._saves = log, log.with_suffix(".events"), saves
+        self.log = log
+        self._events = log.with_suffix(".events")
+        self._saves = saves
         log.parent.mkdir(parents=True, exist_ok=True)
         self._events.open("wb").close()
         code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
@@ -105,11 +108,15 @@ class Worker:
             if self._process.poll() is None and self._saves:
                 with suppress(OSError):  # The terminal may be gone.
                     on_event("stopping")
-                self._end(error.number if isinstance(error, Interrupted) else signal.SIGTERM)
+                if isinstance(error, Interrupted):
+                    self._end(error.number)
+                else:
+                    self._end(signal.SIGTERM)
             raise
 
     def _listen(self, on_event: OnEvent) -> Any:
-        sentence, is_input, rest = None, False, b""
+        error: dict[str, Any] | None = None
+        rest = b""
         with self._events.open("rb") as file:
             while self._process.returncode is None:
                 with suppress(subprocess.TimeoutExpired):
@@ -123,19 +130,29 @@ class Worker:
                             self._process.wait()
                         return fields["value"]
                     if event == "error":
-                        sentence, is_input = fields["sentence"], fields["is_input"]
+                        error = fields
                     else:
                         on_event(event, **fields)
-        if sentence is not None and is_input:
-            raise InputError(sentence)
+        raise self._failure(error)
+
+    def _failure(self, error: dict[str, Any] | None) -> InputError | WorkerError:
+        """Return the exception for the end of the process without a result; `error` has the fields of its event."""
+        if error is not None and error["is_input"]:
+            return InputError(error["sentence"])
         with self.log.open("rb") as file:
             file.seek(max(self._start, self.log.stat().st_size - _KEPT_BYTES))
             output = file.read().decode(errors="replace")
         exitcode = self._process.returncode
         if exitcode < 0:
             name = signal.Signals(-exitcode).name
-            sentence = f"it was ended by {name}" + ", most likely for want of memory" * (name == "SIGKILL")
-        raise WorkerError((sentence or _last_sentence(output.splitlines())).rstrip("."), exitcode, output)
+            sentence = f"it was ended by {name}"
+            if name == "SIGKILL":
+                sentence += ", most likely for want of memory"
+        elif error is not None and error["sentence"]:
+            sentence = error["sentence"]
+        else:
+            sentence = _last_sentence(output.splitlines())
+        return WorkerError(sentence.rstrip("."), exitcode, output)
 
     def _end(self, number: int) -> None:
         """Send a signal and wait until the process has ended; Ctrl-C meanwhile kills it."""
@@ -157,9 +174,12 @@ def _last_sentence(lines: Sequence[str]) -> str:
     """Return the last sentence that a command printed; of a box, as around a wrong option, the first paragraph."""
     if lines and lines[-1].startswith("╰"):
         boxed = [line.strip("│ ") for line in lines if line.startswith("│ ")]
-        return " ".join(text for text in itertools.takewhile(lambda text: not text.startswith("──"), boxed) if text)
-    told = (line.strip() for line in reversed(lines) if re.search(r"\w", line) and not line.startswith(_PROMPT))
-    return _PREFIX.sub("", next(told, "it printed nothing"))
+        paragraph = itertools.takewhile(lambda text: not text.startswith("──"), boxed)
+        return " ".join(text for text in paragraph if text)
+    for line in reversed(lines):
+        if re.search(r"\w", line) and not line.startswith(_PROMPT):
+            return _PREFIX.sub("", line.strip())
+    return "it printed nothing"
 
 
 def main() -> None:
@@ -173,7 +193,8 @@ def main() -> None:
             os._exit(0)
 
     atexit.register(leave)  # As the first, it is called last, when no thread runs any more.
-    channel, nowhere = os.dup(0), os.open(os.devnull, os.O_RDONLY)
+    channel = os.dup(0)
+    nowhere = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
     try:
         function = pkgutil.resolve_name(sys.argv[1])
@@ -186,7 +207,8 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(128 + signal.SIGINT) from None
     except Exception as error:
-        if (sentence := sentence_of(error)) is None:
+        sentence = sentence_of(error)
+        if sentence is None:
             tracebacks.print_exc()
             sentence = tracebacks.format_exception_only(error)[-1].strip()
         else:

@@ -22,7 +22,9 @@ def parse(options: type[Options], name: str, argv: Sequence[str] | None) -> Opti
 
     `options` is a dataclass; its docstring and those of its fields are the help. The exit code is 2 after an error.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        argv = sys.argv[1:]
+    words = list(argv)
     if "--version" in words:
         print(f"{name} {version('sadgs_ns')}")
         raise SystemExit(0)
@@ -38,14 +40,27 @@ def exit_code(name: str, folder: Path | None, run: Callable[[], int]) -> int:
     try:
         return run()
     except InputError as error:
-        told, code = str(error), 2
-    except (OSError, RunError) as error:
-        told, code = str(error), 1
-        if isinstance(error, OSError) and error.errno is not None:
-            where, free = error.filename or folder or Path(), free_space(folder or Path())
-            told = f"{where}: {reason(error)} ({free} free there); run the same command again to resume."
-    except KeyboardInterrupt as stopped:
-        told = "stopped; run the same command again to resume."
-        code = 128 + (stopped.number if isinstance(stopped, Interrupted) else signal.SIGINT)
-    print(f"{name}: {told}", file=sys.stderr)
+        sentence = str(error)
+        code = 2
+    except RunError as error:
+        sentence = str(error)
+        code = 1
+    except OSError as error:
+        sentence = _explain(error, folder or Path())
+        code = 1
+    except KeyboardInterrupt as stop:
+        sentence = "stopped; run the same command again to resume."
+        number = signal.SIGINT
+        if isinstance(stop, Interrupted):
+            number = stop.number
+        code = 128 + number
+    print(f"{name}: {sentence}", file=sys.stderr)
     return code
+
+
+def _explain(error: OSError, folder: Path) -> str:
+    """Return a sentence on an error of the operating system, or our own if the error was raised with one."""
+    if error.errno is None:
+        return str(error)
+    where = error.filename or folder
+    return f"{where}: {reason(error)} ({free_space(folder)} free there); run the same command again to resume."

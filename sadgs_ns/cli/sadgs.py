@@ -54,7 +54,9 @@ def make_splat(work: PhotosToSplat) -> list[Path]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Make a splat and return the exit code, as `exit_code` says."""
     start = time.monotonic()
-    words = list(sys.argv[1:] if argv is None else argv)
+    if argv is None:
+        argv = sys.argv[1:]
+    words = list(argv)
     train_options: list[str] = []
     if "--" in words:
         end = words.index("--")

@@ -22,8 +22,13 @@ class StatusLine:
     """The name of a stage, its time and its status. A terminal shows each change; a file gets the line at the end."""
 
     def __init__(self, name: str, console: Console) -> None:
-        self._name, self._console, self._status, self._start = name, console, "", time.monotonic()
-        self._live = Live(console=console, get_renderable=self._text) if console.is_terminal else None
+        self._name = name
+        self._console = console
+        self._status = ""
+        self._start = time.monotonic()
+        self._live: Live | None = None
+        if console.is_terminal:
+            self._live = Live(console=console, get_renderable=self._text)
 
     def __enter__(self) -> StatusLine:
         if self._live is not None:
@@ -44,7 +49,8 @@ class StatusLine:
         """Leave the line as it is with this status, and begin another one of its name."""
         self._status = status
         self._console.print(self._text(), soft_wrap=True)
-        self._status, self._start = "", time.monotonic()
+        self._status = ""
+        self._start = time.monotonic()
 
     def print(self, sentence: str) -> None:
         """Print a sentence above the line."""
@@ -52,20 +58,23 @@ class StatusLine:
 
     def _text(self) -> Text:
         passed = clock(time.monotonic() - self._start)
-        return Text(f"{self._name:<9}{passed:>8}  {self._status}".rstrip(), no_wrap=True, overflow="ellipsis")
+        line = f"{self._name:<9}{passed:>8}  {self._status}".rstrip()
+        return Text(line, no_wrap=True, overflow="ellipsis")
 
 
 def clock(seconds: float) -> str:
     """Return a time as "1:02" or "1:00:02"."""
     minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}" if minutes >= 60 else f"{minutes}:{rest:02}"
+    if minutes < 60:
+        return f"{minutes}:{rest:02}"
+    return f"{minutes // 60}:{minutes % 60:02}:{rest:02}"
 
 
 class Timeline:
     """The parts of a command's stages, each of which lasts until the next begins."""
 
     def __init__(self) -> None:
-        self._begun: list[tuple[str, str, float]] = []
+        self._begun: list[tuple[str, str, float]] = []  # Stage, part and time of its beginning
 
     def begin(self, stage: str, part: str) -> None:
         """End the present part and begin another one, unless it is the present one."""
@@ -80,8 +89,13 @@ class Timeline:
             self.begin(self._begun[-1][0], fields["stage"])
 
     def _seconds(self) -> list[tuple[str, str, float]]:
-        ends = [*(begun for _, _, begun in self._begun[1:]), time.monotonic()]
-        return [(stage, part, end - begun) for (stage, part, begun), end in zip(self._begun, ends, strict=False)]
+        """Return stage, part and seconds of each part."""
+        lengths = []
+        end = time.monotonic()
+        for stage, part, begun in reversed(self._begun):
+            lengths.append((stage, part, end - begun))
+            end = begun
+        return lengths[::-1]
 
     def __str__(self) -> str:
         """Return the times of the stages, as "cameras 0:15, start 0:03"."""

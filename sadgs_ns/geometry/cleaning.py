@@ -72,8 +72,10 @@ def measure_visibility(
     opacities = params["opacities"].detach().flatten().sigmoid()
     sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # Others cannot be drawn.
     means, quats, scales = (torch.where(sound[:, None], value, 0.0) for value in shapes)
-    scales, opacities = scales.exp(), torch.where(sound, opacities, 0.0)
-    views, pixels = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means))
+    scales = scales.exp()
+    opacities = torch.where(sound, opacities, 0.0)
+    views = means.new_zeros(len(means), dtype=torch.int64)
+    pixels = means.new_zeros(len(means))
     number = 0
     for viewmat, K, width, height in cameras:
         with torch.enable_grad():
@@ -97,7 +99,8 @@ def find_remaining(
     Returns:
         Which stay, bool [N]; and for each option that is set a sentence, with how many it takes of what is left.
     """
-    means, extents = params["means"].detach(), params["scales"].detach().amax(dim=1).exp()
+    means = params["means"].detach()
+    extents = params["scales"].detach().amax(dim=1).exp()
     goes: list[tuple[Tensor, str]] = []
     if cleaning.crop is not None:
         low, high = means.new_tensor(cleaning.crop).view(2, 3)
@@ -110,7 +113,8 @@ def find_remaining(
         dust = f"of less than {cleaning.dust:g} px in every training view"
         goes += [(seen.views < cleaning.min_views, few)] if cleaning.min_views else []
         goes += [(seen.pixels < cleaning.dust, dust)] if cleaning.dust else []
-    stays, sentences = torch.ones(len(means), dtype=torch.bool, device=means.device), []
+    stays = torch.ones(len(means), dtype=torch.bool, device=means.device)
+    sentences = []
     for taken, which in goes:
         number = int((stays & taken).sum())
         stays &= ~taken

@@ -110,41 +110,53 @@ class RunningStrategy(Strategy):
 
     def observes(self, step: int) -> bool:
         """Tell whether `step_pre_backward` will measure η at this step, and so needs structure tensors."""
-        if step % self.windows.eta_every != 0:
+        windows = self.windows
+        if step % windows.eta_every != 0:
             return False
         # After the last step that reads the statistics, nothing would read an observation.
-        readers = [rule for rule in RULES.values() if rule.reads == "statistics"]
-        next_reader = min(next_due(step + 1, rule.every(self.windows)) for rule in readers)
-        return next_reader <= self.windows.refine_stop_iter
+        for rule in RULES.values():
+            if rule.reads != "statistics":
+                continue
+            next_step = next_due(step + 1, rule.every(windows))
+            if next_step <= windows.refine_stop_iter:
+                return True
+        return False
 
     def needs_absgrad(self, step: int) -> bool:
         """Tell whether an AbsGS step will read this step's absolute screen gradients; a structure step drops them."""
-        first = max(step + 1, self.windows.refine_start_iter)
+        windows = self.windows
+        first = max(step + 1, windows.refine_start_iter)
         soonest = math.inf
         reads = None
         for rule in RULES.values():
             if rule.reads is None:
                 continue
-            iteration = next_due(first, rule.every(self.windows))
+            iteration = next_due(first, rule.every(windows))
             # Of rules that are due at once, the first one acts.
             if iteration < soonest:
                 soonest = iteration
                 reads = rule.reads
-        return reads == "gradients" and soonest <= self.windows.refine_stop_iter
+        if soonest > windows.refine_stop_iter:
+            return False
+        return reads == "gradients"
 
     def densifies(self, step: int) -> bool:
         """Tell whether `densify` may replace tensors of parameters or statistics at this step."""
         iteration = step + 1
+        windows = self.windows
         if not self._is_inside(iteration):
             return False
-        if iteration == self.windows.refine_stop_iter:
+        if iteration == windows.refine_stop_iter:
             return True
-        return due(iteration, self.windows.reset_every) or due_rule(iteration, self.windows) is not None
+        if due(iteration, windows.reset_every):
+            return True
+        return due_rule(iteration, windows) is not None
 
     def _is_inside(self, iteration: int) -> bool:
-        return self.windows.refine_start_iter <= iteration <= self.windows.refine_stop_iter
+        windows = self.windows
+        return windows.refine_start_iter <= iteration <= windows.refine_stop_iter
 
-    # --- steps ---
+    # --- what steps do ---
 
     def accumulate(self, state: State, step: int, info: Infos) -> None:
         """Add the screen gradients of a backward pass to the state, if an AbsGS step will read them."""
@@ -180,7 +192,10 @@ class RunningStrategy(Strategy):
     def _resets(self, iteration: int) -> bool:
         """Tell whether opacities are reset; just before the final prune that would leave no time to recover."""
         every = self.windows.reset_every
-        return due(iteration, every) and iteration <= self.windows.refine_stop_iter - every // 4
+        if not due(iteration, every):
+            return False
+        latest = self.windows.refine_stop_iter - every // 4
+        return iteration <= latest
 
     def prune_haze(self, params: Params, optimizers: Optimizers, state: State) -> None:
         """Remove the haze near the state's `camera_paths`, which also arises after the last densification step."""

@@ -95,17 +95,20 @@ class StructureAwareStrategy(Strategy):
     def check(self) -> None:
         """Raise ValueError if an option is out of its range."""
         for name in ("max_gaussians", "eta_every", "min_observations"):
-            if (value := getattr(self, name)) is not None and value < 1:
+            value = getattr(self, name)
+            if value is not None and value < 1:
                 raise ValueError(f"strategy.{name} must be at least 1, got {value}.")
         iterations = ("structure_every", "absgs_every", "refine_start_iter", "refine_stop_iter", "reset_every")
         for name in (*iterations, "clone_grad2d", "split_absgrad2d"):
-            if (value := getattr(self, name)) is not None and not value >= 0:
-                raise ValueError(f"strategy.{name} must not be negative, got {getattr(self, name):g}.")
+            value = getattr(self, name)
+            if value is not None and not value >= 0:  # This refuses NaN, too.
+                raise ValueError(f"strategy.{name} must not be negative, got {value:g}.")
         if not 1 <= self.child_scale < 2:
             raise ValueError(f"strategy.child_scale must be at least 1 and less than 2, got {self.child_scale:g}.")
         for name in ("tau_split", "split_min_opacity", "min_opacity"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"strategy.{name} must be in [0, 1], got {getattr(self, name):g}.")
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise ValueError(f"strategy.{name} must be in [0, 1], got {value:g}.")
 
     # --- gsplat's interface of a strategy; `RunningStrategy` documents it ---
 

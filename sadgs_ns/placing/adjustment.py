@@ -1,8 +1,8 @@
 """The last adjustment of cameras and points, in which wrong matches hardly count.
 
 COLMAP's own minimises the squares of residuals, so that a few wrong matches among thousands pull the cameras: with
-other random samples, points of the scene `castle` move by a tenth of a pixel on the mean. A robust loss lets each
-observation pull less the further it lies from its point (docs/results.md#cameras).
+other random samples, points of the scene `castle` move by a tenth of a pixel on the mean. With a robust loss, each
+observation pulls less the further it lies from its point.
 """
 
 from __future__ import annotations

@@ -23,9 +23,12 @@ class Summary:
     attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
 
     def __str__(self) -> str:
-        found = f"{self.registered} of {self.photos} photos registered, {self.points:,} points, mean reprojection error"
-        told = f"{found} {self.reprojection_error:.2f} px. {self.attempts}".rstrip()
-        return "\n".join([told, *(f"  {name}: {why}" for name, why in sorted(self.left_out.items()))])
+        registered = f"{self.registered} of {self.photos} photos registered, {self.points:,} points"
+        error = f"mean reprojection error {self.reprojection_error:.2f} px."
+        lines = [f"{registered}, {error} {self.attempts}".rstrip()]
+        for name, reason in sorted(self.left_out.items()):
+            lines.append(f"  {name}: {reason}")
+        return "\n".join(lines)
 
     @property
     def is_poor(self) -> bool:
@@ -37,4 +40,8 @@ def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:
     """Return how pairs of so many photos, or frames of a video, are chosen; any way but "auto"."""
     if asked != "auto":
         return asked
-    return "sequential" if is_video else "exhaustive" if photos <= EXHAUSTIVE_LIMIT else "similar"
+    if is_video:
+        return "sequential"
+    if photos <= EXHAUSTIVE_LIMIT:
+        return "exhaustive"
+    return "similar"

@@ -25,7 +25,7 @@ from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.run.memory_plan import choose_image_storage
 from sadgs_ns.training.run.progress import note, warn
-from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.run.run_plan import RunPlan, unknown_fields
 from sadgs_ns.training.step import nonfinite
 from sadgs_ns.training.step.images import stack
 from sadgs_ns.training.step.nonfinite import NonFiniteLog
@@ -286,8 +286,16 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the order of the views only if their number is the same."""
-        self.follow(RunPlan.of(state["plan"]))
+        """Restore what `get_extra_state` saved; the order of the views only if their number is the same.
+
+        A warning names the fields of the plan that another version wrote and this one does not have.
+        """
+        plan = RunPlan.of(state["plan"])
+        unknown = unknown_fields(state["plan"])
+        if unknown:
+            problem = "The checkpoint's plan has options that this version of sadgs does not have"
+            warn(f"{problem}; they are ignored: {', '.join(unknown)}.")
+        self.follow(plan)
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":

@@ -14,6 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from torch import Tensor
 
+from sadgs_ns.method.running_strategy import RunningStrategy
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import RenderOptions
@@ -57,7 +58,7 @@ class Model(Protocol):
         ...
 
     @property
-    def strategy(self) -> StructureAwareStrategy:
+    def strategy(self) -> RunningStrategy:
         """Densification, which follows the plan's."""
         ...
 
@@ -105,7 +106,7 @@ class StructureTensors(Protocol):
         """Load the photos, and compute S̄ of those for which there is room."""
         ...
 
-    def photo(self, data: Mapping[str, Any]) -> Tensor:
+    def photo(self, data: Mapping[str, Any], /) -> Tensor:
         """Return an image of the datamanager as the loss sees it. [H, W, 3]"""
         ...
 

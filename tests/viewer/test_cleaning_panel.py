@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
@@ -105,6 +107,16 @@ def test_a_reversed_box_is_told_and_changes_nothing(pipeline: SadgsPipeline, cap
     assert said.startswith("The picture stays as it was: --crop -100 -100 -100 -200 100 100 is no box: give ")
     assert "is no box" in " ".join(capsys.readouterr().out.split())
     assert torch.equal(shown(pipeline)[1], before)
+
+
+@torch.no_grad()
+def test_a_camera_that_is_no_pinhole_leaves_the_preview_empty_and_the_viewer_drawing(pipeline: SadgsPipeline):
+    set_to(pipeline.cleaning, choice=STAYS)
+    camera = copy.deepcopy(pipeline.datamanager.train_dataset.cameras[:1])
+    camera.camera_type = torch.full_like(camera.camera_type, CameraType.EQUIRECTANGULAR.value)
+    outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
+    assert torch.equal(outputs[OUTPUT], outputs["rgb"])
+    assert not outputs["accumulation"].any()
 
 
 def test_evaluation_gets_no_picture_of_the_panel(pipeline: SadgsPipeline):

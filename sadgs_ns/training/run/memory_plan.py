@@ -43,7 +43,8 @@ def training_size(datamanager: FullImageDatamanager, views: int, processes: int 
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     if datamanager.config.cache_images == "gpu":
-        kept, structure = image_bytes(datamanager), 0.0
+        kept = image_bytes(datamanager)
+        structure = 0.0
     else:  # The images of the next step are there, too. A process has those that it composites, and S̄ of all.
         sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
         here = views  # A process may have a part of each view if there are several sizes.
@@ -118,7 +119,8 @@ def fit_to_memory(
     A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
     `max_gaussians` is lowered; without CUDA, nothing is. Returns the cap and a line; raises InputError if none fit.
     """
-    device, n = params["means"].device, len(params["means"])
+    device = params["means"].device
+    n = len(params["means"])
     free, total = memory.available_bytes(device)
     if math.isinf(free):
         return cap, f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
@@ -148,5 +150,6 @@ def fit_to_memory(
             why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
             if cap < n * processes:
                 why += f", which holds no more than the {n * processes:,} at the start: none will be added"
-    needed, card = need(max(-(-cap // processes), n)), "the card" if processes == 1 else "each card"
+    needed = need(max(-(-cap // processes), n))
+    card = "the card" if processes == 1 else "each card"
     return cap, f"At most {cap:,} Gaussians: {needed / 1e9:.1f} GB of {card}'s {total / 1e9:.1f} GB{why}."

@@ -48,8 +48,10 @@ def decide_near_plane(pipeline: SadgsPipeline, before: RunPlan | None) -> float:
 
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
     """Decide iterations and views a step: by options, by an equal effort's plan `before`, or by rule."""
-    effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
-    if before is not None and before.requested["effort"] == effort:
+    effort = config.pipeline.effort
+    iterations = config.max_num_iterations
+    in_step = config.pipeline.views_per_iteration
+    if before is not None and before.requested.get("effort", effort) == effort:
         iterations = before.iterations if iterations is None else iterations
         in_step = before.views_per_iteration if in_step is None else in_step
     return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
@@ -87,8 +89,10 @@ def plan_run(
     The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
     is the plan of the checkpoint's run, after `done` iterations. Raises InputError if the memory holds no Gaussians.
     """
-    options, model = config.pipeline, pipeline.model
-    strategy, cap = options.model.strategy, options.model.strategy.max_gaussians
+    options = config.pipeline
+    model = pipeline.model
+    strategy = options.model.strategy
+    cap = options.model.strategy.max_gaussians
     requested = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
     requested |= {f"model.strategy.{name}": value for name, value in asdict(strategy).items()}
     old = requested if before is None else requested | before.requested
@@ -101,7 +105,8 @@ def plan_run(
         if before is not None and same and cap > before.strategy.max_gaussians:
             cap = before.strategy.max_gaussians
             note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
-    of_effort, of_start = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
+    of_effort = growth_threshold(options.effort)
+    of_start = DENSE_THRESHOLDS if dense else 1.0
     clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
     planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
     planned = planned.fitted(length.iterations)
@@ -113,7 +118,8 @@ def plan_run(
             "Train longer or lower pipeline.model.strategy.structure-every."
         )
     _print_length(config, pipeline, length, done)
-    extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
+    extent = float(model.strategy_state["scene_scale"])
+    groups = pipeline.get_param_groups()
     optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
     return RunPlan(
         **vars(length),
@@ -129,10 +135,14 @@ def plan_run(
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
     """Print how long the run is, and what decided it."""
-    cameras, effort = pipeline.datamanager.train_dataset.cameras, config.pipeline.effort
+    cameras = pipeline.datamanager.train_dataset.cameras
+    effort = config.pipeline.effort
     requested = config.pipeline.views_per_iteration
-    views, in_step, iterations = len(cameras), length.views_per_iteration, length.iterations
-    steps_done, times = f", of which {done:,} are done" if done else "", round(iterations * in_step / views)
+    views = len(cameras)
+    in_step = length.views_per_iteration
+    iterations = length.iterations
+    steps_done = f", of which {done:,} are done" if done else ""
+    times = round(iterations * in_step / views)
     note(
         f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
         f"{iterations:,} iterations of {in_step} view{'s' * (in_step > 1)}{steps_done}, so that each view is rendered "
@@ -150,7 +160,8 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
 def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
     """Return the cap of Gaussians that the devices' memory allows, and print what decided it."""
     params: Any = pipeline.model.gauss_params
-    world, cap = pipeline.model.world, options.model.strategy.max_gaussians
+    world = pipeline.model.world
+    cap = options.model.strategy.max_gaussians
     size = training_size(pipeline.datamanager, views, world.num_ranks)
     cap, line = fit_to_memory(cap, params, size, options.memory_budget_gb, world.num_ranks)
     note(line)

@@ -62,7 +62,8 @@ def check_devices(machine: MachineConfig) -> bool:
         raise InputError(f"{problem}: set it to 1, or start the run with torchrun.")
     if machine.num_devices == 1 and number_of_processes() == 1:
         return False
-    wanted, found = max(machine.num_devices, processes_on_this_machine()), torch.cuda.device_count()
+    wanted = max(machine.num_devices, processes_on_this_machine())
+    found = torch.cuda.device_count()
     if machine.device_type == "cuda" and wanted > found:
         problem = f"The run is to take {wanted} CUDA devices of this machine, and torch finds {found}"
         raise InputError(f"{problem}: lower machine.num_devices, or torchrun's --nproc-per-node.")
@@ -91,7 +92,8 @@ class Peers:
 
     def ended(self) -> bool:
         """Tell whether a process of this machine ended, after waiting some seconds for one."""
-        end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
+        end = time.monotonic() + _REAPED_SECONDS
+        here = socket.gethostname()
         while all(_exists(pid) for host, pid in self._places if host == here):
             if time.monotonic() > end:
                 return False

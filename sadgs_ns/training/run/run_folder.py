@@ -15,15 +15,24 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sadgs_ns.data.checks.capture import check_ahead
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
+from sadgs_ns.training.options import drop_unknown
 from sadgs_ns.training.run import checkpoints, processes
+from sadgs_ns.training.run.progress import warn
 
 
 def begin(config: TrainerConfig) -> None:
-    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`."""
+    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`.
+
+    A warning names options of a loaded `config.yml` that this version does not have, and the new one leaves them out.
+    """
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():
         return
+    unknown = drop_unknown(config)
+    if unknown:
+        problem = "config.yml has options that this version of sadgs does not have"
+        warn(f"{problem}; they are ignored: {', '.join(unknown)}.")
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)
     data: Any = config.pipeline.datamanager

@@ -7,9 +7,11 @@ and change nothing in the files.
 
 from __future__ import annotations
 
+import copy
 import json
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,8 +32,12 @@ from plyfile import PlyData
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
 from sadgs_ns.cli import export, inspect
+from sadgs_ns.errors import InputError
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.training.config import SadgsTrainerConfig, SadgsViewerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run.run_plan import Rate, RunPlan, unknown_fields
 from sadgs_ns.viewer import color_scales
 from sadgs_ns.viewer.structure_panel import OUTPUT
 
@@ -212,3 +218,148 @@ def test_sadgs_inspect_draws_an_old_run(
     assert f"after {DONE} iterations" in capsys.readouterr().out
     names = ("ellipses", "wavelength", "eta", "children", "low", "step")
     assert {path.name for path in tmp_path.iterdir()} == {f"train-001-{name}.png" for name in names}
+
+
+# --- runs of versions with other options ---
+
+
+@dataclass
+class LaterStrategy(StructureAwareStrategy):
+    """A strategy of a later version, with an option whose default a function makes."""
+
+    weights: list[float] = field(default_factory=lambda: [1.0, 2.0])
+
+
+def change_plan(plan: dict[str, Any]) -> None:
+    """Let another version have written a checkpoint's plan: with more fields, and without some."""
+    plan["color_space"] = "linear"
+    plan["strategy"]["tau_merge"] = 2.0
+    del plan["strategy"]["child_scale"]
+    for rate in plan["rates"].values():
+        rate["warmup"] = 3
+        del rate["initial_factor"]
+    plan["requested"]["model.strategy.tau_merge"] = 2.0
+    del plan["requested"]["model.strategy.child_scale"], plan["requested"]["effort"]
+
+
+UNKNOWN = "color_space, strategy.tau_merge, rates.warmup"
+
+
+def change_checkpoint() -> None:
+    """Let another version have written the run's checkpoint, in the working directory."""
+    checkpoint = read_checkpoint(DONE - 1)
+    change_plan(checkpoint["pipeline"]["_extra_state"]["plan"])
+    torch.save(checkpoint, CHECKPOINTS / f"step-{DONE - 1:09d}.ckpt")
+
+
+def change_config(path: Path) -> None:
+    """Let another version have written a `config.yml`: with more options, and without some."""
+    config = yaml.load(path.read_text("utf8"), Loader=yaml.Loader)
+    old = vars(config.pipeline.model.strategy)
+    config.pipeline.model.strategy = LaterStrategy(**old)
+    strategy = vars(config.pipeline.model.strategy)
+    strategy["tau_merge"] = 2.0
+    config.optimizers["means"]["optimizer"].amsgrad = True
+    for values, name in ((strategy, "child_scale"), (strategy, "weights"), (vars(config), "viewer")):
+        del values[name]
+    path.write_text(yaml.dump(config), "utf8")
+
+
+def lines_with(text: str, word: str) -> list[str]:
+    return [line for line in text.splitlines() if word in line]
+
+
+def test_a_plan_of_another_version_has_defaults_where_fields_are_missing(loadable: Path):
+    plan = read_checkpoint(DONE - 1)["pipeline"]["_extra_state"]["plan"]
+    assert unknown_fields(plan) == []
+    changed = copy.deepcopy(plan)
+    changed["strategy"]["child_scale"] = 1.25
+    changed["rates"]["means"]["initial_factor"] = 0.5
+    assert RunPlan.of(changed).strategy.child_scale == 1.25
+    change_plan(changed)
+    read = RunPlan.of(changed)
+    assert read.strategy.child_scale == StructureAwareStrategy.child_scale != 1.25
+    assert read.rates["means"] == Rate(**{**plan["rates"]["means"], "initial_factor": Rate.initial_factor})
+    assert read.iterations == ITERATIONS
+    assert ", ".join(unknown_fields(changed)) == UNKNOWN
+
+
+@pytest.mark.hard_case(
+    "a checkpoint whose plan lacks a field that has no default", "one sentence, which names the field"
+)
+@pytest.mark.parametrize("names", [("iterations",), ("strategy",), ("rates", "means", "lr")])
+def test_a_field_without_a_default_that_is_missing_is_named(names: tuple[str, ...], resumable: Path):
+    checkpoint = read_checkpoint(DONE - 1)
+    values = checkpoint["pipeline"]["_extra_state"]["plan"]
+    for name in names[:-1]:
+        values = values[name]
+    del values[names[-1]]
+    torch.save(checkpoint, CHECKPOINTS / f"step-{DONE - 1:09d}.ckpt")
+    problem = rf"The checkpoint's plan has no {'.'.join(names)}: load it with the version of sadgs that wrote it"
+    with pytest.raises(InputError, match=rf"^{problem}\.$"):
+        measure(resumable, Path("results.json"))
+    config = yaml.load(resumable.read_text("utf8"), Loader=yaml.Loader)
+    with pytest.raises(InputError, match=rf"\.ckpt cannot be continued: {problem}; give --load-dir "):
+        set_up(config)
+
+
+@pytest.mark.hard_case(
+    "a checkpoint of a version whose plan, strategy or rates have other fields",
+    "goes on with the defaults of missing ones; one line names those that are ignored",
+)
+def test_a_checkpoint_of_a_version_with_other_options_goes_on(resumable: Path, capsys: pytest.CaptureFixture[str]):
+    change_checkpoint()
+    config = yaml.load(resumable.read_text("utf8"), Loader=yaml.Loader)
+    config.max_num_iterations = None  # The plan's is taken if the effort is the same.
+    trainer = set_up(config)
+    printed = capsys.readouterr().out
+    assert lines_with(printed, "tau_merge") == [
+        f"The checkpoint's plan has options that this version of sadgs does not have; they are ignored: {UNKNOWN}."
+    ]
+    assert "had other settings" not in printed
+    assert trainer._start_step == DONE and trainer.pipeline.model.plan.iterations == ITERATIONS
+    trainer.train()
+    assert unknown_fields(read_checkpoint(ITERATIONS - 1)["pipeline"]["_extra_state"]["plan"]) == []
+
+
+def test_a_checkpoint_of_a_version_with_other_options_is_measured_as_before(
+    resumable: Path, capsys: pytest.CaptureFixture[str]
+):
+    change_checkpoint()
+    now = measure(resumable, Path("results.json"))
+    assert now["psnr"] == pytest.approx(MEASURED["interrupted"]["psnr"], abs=0.01)
+    (line,) = lines_with(capsys.readouterr().out, "tau_merge")
+    assert line.endswith(f"they are ignored: {UNKNOWN}.")
+
+
+def test_a_config_of_a_version_with_other_options_has_defaults_where_some_are_missing(resumable: Path):
+    change_config(resumable)
+    text = resumable.read_text("utf8")
+    assert "tau_merge" in text and not {"child_scale", "weights", "viewer"} & set(text.replace(":", " ").split())
+    config = yaml.load(text, Loader=yaml.Loader)
+    assert isinstance(config, SadgsTrainerConfig)
+    strategy: Any = config.pipeline.model.strategy
+    assert vars(strategy)["child_scale"] == StructureAwareStrategy.child_scale
+    assert strategy.weights == [1.0, 2.0] and config.viewer == SadgsViewerConfig()
+    assert strategy.max_gaussians == 400 and config.load_dir == CHECKPOINTS, "what the file says stays"
+    again = yaml.load(text, Loader=yaml.Loader)
+    assert again.pipeline.model.strategy.weights is not strategy.weights
+    assert measure(resumable, Path("results.json"))["psnr"] == pytest.approx(MEASURED["interrupted"]["psnr"], abs=0.01)
+
+
+@pytest.mark.hard_case(
+    "a `config.yml` of a version with other options",
+    "goes on with the defaults of missing ones; one line names those that are ignored, and the new file lacks them",
+)
+def test_a_config_of_a_version_with_other_options_goes_on(resumable: Path, capsys: pytest.CaptureFixture[str]):
+    change_config(resumable)
+    ns_train(tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", "--load-config", str(resumable)]))
+    printed = capsys.readouterr().out
+    assert lines_with(printed, "tau_merge") == [
+        "config.yml has options that this version of sadgs does not have; they are ignored: "
+        "pipeline.model.strategy.tau_merge, optimizers.means.optimizer.amsgrad."
+    ]
+    assert "had other settings" not in printed
+    assert [path.name for path in CHECKPOINTS.iterdir()] == [f"step-{ITERATIONS - 1:09d}.ckpt"]
+    written = resumable.read_text("utf8")
+    assert "tau_merge" not in written and "amsgrad" not in written and "weights" in written
