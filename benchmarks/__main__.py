@@ -5,21 +5,14 @@ Every run is a process of its own, so that none inherits another's memory, cache
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib
 import itertools
 import json
-import os
 import re
-import shutil
-import signal
 import subprocess
 import sys
-import tempfile
-import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -29,12 +22,8 @@ from tyro.conf import Positional
 from benchmarks import gate, protocol, results
 from benchmarks.protocol import Job
 from benchmarks.results import Result
+from benchmarks.side_by_side import devices_of, environment_of, run_side_by_side, sigterm_exits
 from benchmarks.table import markdown
-
-POLL_SECONDS = 0.2
-KILL_SECONDS = 40.0
-"""How long a run may take to end when it is asked to, before it is killed: torchrun kills its processes, which have
-sessions of their own, after 30 s."""
 
 COMMANDS = {
     "table": ("table:Command", "the table of a results file, and a plot of quality against time"),
@@ -53,11 +42,6 @@ Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 """Starts a job on a GPU (None: any; "0+1": two) in a folder, where `result.json` and `log` appear."""
 
 
-def devices_of(gpu: str | None) -> list[str]:
-    """The GPUs that a run takes together, "0+1" being two; none are named where any will do."""
-    return [] if gpu is None else gpu.split("+")
-
-
 def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
     """What a process that has ended measured; the output of one that failed goes to the log."""
     written, output = folder / "result.json", folder / "log"
@@ -68,18 +52,6 @@ def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
             file.write(f"=== {job.key}\n{output.read_text(errors='replace')}\n")
     identity = {"scene": job.scene.name, "label": job.row.label, "method": job.row.method, "seed": job.seed}
     return {"key": job.key, **identity, "overrides": job.row.overrides, **measured}
-
-
-def _stop(process: subprocess.Popen[bytes]) -> None:
-    """End a process and what it started."""
-    try:
-        os.killpg(process.pid, signal.SIGTERM)
-        process.wait(KILL_SECONDS)
-    except ProcessLookupError:
-        pass
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
 
 
 def launcher(root: Path) -> Launch:
@@ -93,15 +65,10 @@ def launcher(root: Path) -> Launch:
             torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(len(devices))]
             command = [*torchrun, *command]
         command = [sys.executable, *command]
-        # The checkout is where the run imports this from, whatever folder the benchmark was started in.
-        paths = [str(Path(__file__).resolve().parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-        if gpu is not None:
-            environment["CUDA_VISIBLE_DEVICES"] = ",".join(devices)
         with (folder / "log").open("wb") as log:
             # No prompt of nerfstudio's may wait for somebody, and a compiler that the run started can be ended with it.
             apart = partial(subprocess.Popen, stdin=subprocess.DEVNULL, start_new_session=True)
-            return apart(command, stdout=log, stderr=subprocess.STDOUT, env=environment)
+            return apart(command, stdout=log, stderr=subprocess.STDOUT, env=environment_of(gpu))
 
     return launch
 
@@ -118,24 +85,11 @@ def run_all(
 
     `finished` is called with each result as its run ends, and `log` takes the output of runs that fail.
     """
-    pending, free = deque(jobs), deque(gpu for _ in range(jobs_per_gpu) for gpu in gpus)
-    running: list[tuple[subprocess.Popen[bytes], Job, str | None, Path]] = []
-    with tempfile.TemporaryDirectory(prefix="benchmarks-", ignore_cleanup_errors=True) as work:
-        try:
-            while running or pending:
-                while pending and free:
-                    job, gpu, folder = pending.popleft(), free.popleft(), Path(tempfile.mkdtemp(dir=work))
-                    running.append((launch(job, gpu, folder), job, gpu, folder))
-                for run in [run for run in running if run[0].poll() is not None]:
-                    process, job, gpu, folder = run
-                    finished({**_result(job, process.returncode, folder, log), "jobs_per_gpu": jobs_per_gpu})
-                    running.remove(run)
-                    free.append(gpu)
-                    shutil.rmtree(folder, ignore_errors=True)
-                time.sleep(POLL_SECONDS if running else 0)
-        finally:
-            for process, *_ in running:
-                _stop(process)
+
+    def ended(job: Job, code: int, folder: Path) -> None:
+        finished({**_result(job, code, folder, log), "jobs_per_gpu": jobs_per_gpu})
+
+    run_side_by_side(jobs, launch, ended, gpus, jobs_per_gpu)
 
 
 def unfinished(jobs: Sequence[Job], done: Sequence[Result]) -> list[Job]:
@@ -155,16 +109,6 @@ def line(result: Result) -> str:
         f"{name}: loop {result['loop_seconds']:.1f} s, PSNR {result['psnr']:.2f}, SSIM {result['ssim']:.4f}{lpips}, "
         f"{result['gaussians']:,} Gaussians{peak}"
     )
-
-
-@contextlib.contextmanager
-def _sigterm_exits() -> Iterator[None]:
-    """Meanwhile SIGTERM ends the program by an exception, which also ends the runs."""
-    previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
 
 
 @dataclasses.dataclass
@@ -227,7 +171,7 @@ class Benchmark:
             print(f"{next(number)}/{len(jobs)}  {line(result)}", flush=True)
 
         self.output.parent.mkdir(parents=True, exist_ok=True)
-        with _sigterm_exits():
+        with sigterm_exits():
             try:
                 run_all(todo, launcher(self.scenes.resolve()), finished, log, gpus, self.jobs_per_gpu)
             except KeyboardInterrupt:

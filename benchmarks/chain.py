@@ -16,12 +16,9 @@ import datetime
 import itertools
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,10 +29,10 @@ from tyro.conf import Positional
 
 from benchmarks import results
 from benchmarks.chain_table import markdown
+from benchmarks.side_by_side import environment_of, run_side_by_side, sigterm_exits
 
 INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
 SUFFIXES = {".jpg", ".jpeg", ".png"}
-POLL_SECONDS = 0.2
 LOADER = (
     "import sys; from importlib.metadata import entry_points; name = sys.argv[1]; sys.argv = sys.argv[1:]; "
     "(script,) = {s for s in entry_points(group='console_scripts') if s.name == name}; sys.exit(script.load()())"
@@ -92,16 +89,20 @@ def held_out(names: Sequence[str]) -> list[str]:
     return list(names[::INTERVAL])
 
 
-def hold_out(scene: Path, photos: Sequence[str]) -> int:
-    """Write into a scene's `transforms.json` which images are held out, and return the number of the others.
+def photo_of(image: str, photos: Sequence[str]) -> str | None:
+    """Return the photo of a scene's image, whose name is the photo's, or that and another suffix."""
+    if image in photos:
+        return image
+    without = image.rpartition(".")[0]
+    return without if without in photos else None
 
-    An image belongs to the photo whose name it has, perhaps with another suffix behind it.
-    """
+
+def hold_out(scene: Path, photos: Sequence[str]) -> int:
+    """Write into a scene's `transforms.json` which images are held out, and return the number of the others."""
     file = scene / "transforms.json"
     described = json.loads(file.read_text("utf8"))
-    tests = {f"images/{name}" for name in photos}
     names = [frame["file_path"] for frame in described["frames"]]
-    held = [name for name in names if name in tests or name.rpartition(".")[0] in tests]
+    held = [name for name in names if photo_of(name.removeprefix("images/"), photos) is not None]
     described["train_filenames"] = [name for name in names if name not in held]
     described["val_filenames"] = held
     described["test_filenames"] = held
@@ -114,10 +115,9 @@ def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
 
     Raises subprocess.CalledProcessError if a command fails; its output is in `work/log`.
     """
-    environment = dict(os.environ)
-    checkout = str(Path(__file__).resolve().parents[1])
-    before = environment.get("PYTHONPATH", "")
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(site or checkout), before]))
+    environment = environment_of(None)
+    if site is not None:
+        environment["PYTHONPATH"] = os.pathsep.join([str(site), environment["PYTHONPATH"]])
     seconds: dict[str, float] = {}
 
     def call(stage: str, *words: str) -> None:
@@ -146,21 +146,36 @@ def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
     call("export", "sadgs-export", str(run), "--output", str(splat), "--frame", "colmap")
     score = work / "score.json"
     command = [sys.executable, "-m", "benchmarks.chain_score", str(scene), str(chain.photos), str(splat), str(score)]
-    subprocess.run([*command, "--max-size", str(chain.max_size)], env=dict(os.environ), check=True)
+    subprocess.run([*command, "--max-size", str(chain.max_size)], env=environment_of(None), check=True)
     return {"seconds": seconds, "train_views": train_views, **json.loads(score.read_text())}
 
 
 def row_of(chain: Chain, work: Path, site: Path | None, log: Path) -> dict[str, Any]:
     """Run a chain, and return its row, also that of one that fails; the output of that is added to a log."""
-    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
-    identity = {"key": chain.key, "scene": chain.capture, "label": chain.label, "seed": chain.seed, "date": date}
+    date = now()
     try:
-        return {**identity, "status": "ok", "error": None, **run_chain(chain, work, site)}
+        measured = run_chain(chain, work, site)
     except subprocess.CalledProcessError as error:
         output = (work / "log").read_text(errors="replace")
         with log.open("a") as file:
             file.write(f"=== {chain.key}\n{output}\n")
-        return {**identity, "status": "failed", "error": f"{error.cmd[3:5]} ended with code {error.returncode}"}
+        return failed(chain, date, f"{error.cmd[3:5]} ended with code {error.returncode}")
+    return {**identity(chain, date), "status": "ok", "error": None, **measured}
+
+
+def failed(chain: Chain, date: str, error: str) -> dict[str, Any]:
+    """Return the row of a chain that has no score."""
+    return {**identity(chain, date), "status": "failed", "error": error}
+
+
+def identity(chain: Chain, date: str) -> dict[str, Any]:
+    """Return what a row begins with."""
+    return {"key": chain.key, "scene": chain.capture, "label": chain.label, "seed": chain.seed, "date": date}
+
+
+def now() -> str:
+    """Return the time in UTC."""
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
 
 
 @dataclass
@@ -204,54 +219,46 @@ class Command:
         ]
 
     def __call__(self) -> int:
-        """Run them; return 0, or 1 if one failed."""
+        """Run them; return 0, 1 if one failed, or 130 after an interrupt."""
         chains = self.chains()
         done = {row["key"] for row in results.read(self.output, missing_ok=True) if row["status"] == "ok"}
         log = self.output.with_suffix(".log").resolve()
+        todo = [chain for chain in chains if chain.key not in done]
+        gpus = self.gpus.split(",") if self.gpus else (None,)
+
+        def launch(chain: Chain, gpu: str | None, work: Path) -> subprocess.Popen[bytes]:
+            return _start(chain, gpu, work, self.site, log)
+
+        def ended(chain: Chain, code: int, work: Path) -> None:
+            row = written_row(chain, code, work)
+            results.append(self.output, row)
+            print(f"{chain.key}: {line(row)}", flush=True)
+
         self.output.parent.mkdir(parents=True, exist_ok=True)
-        _run_side_by_side(
-            deque(chain for chain in chains if chain.key not in done), self.gpus, self.site, self.output.resolve(), log
-        )
+        with sigterm_exits():
+            try:
+                run_side_by_side(todo, launch, ended, gpus)
+            except KeyboardInterrupt:
+                return 130
         rows = [row for row in results.read(self.output) if row["key"] in {chain.key for chain in chains}]
         print(markdown(results.read(self.output)))
         return int(any(row["status"] != "ok" for row in rows))
 
 
-def _run_side_by_side(chains: deque[Chain], gpus: str | None, site: Path | None, output: Path, log: Path) -> None:
-    """Run chains in processes, one at a time on each GPU, and append their rows to the output as they end."""
-    free = deque(gpus.split(",") if gpus else [None])
-    running: list[tuple[subprocess.Popen[bytes], Chain, str | None, Path]] = []
-    with tempfile.TemporaryDirectory(prefix="chain-", ignore_cleanup_errors=True) as folder:
-        try:
-            while running or chains:
-                while chains and free:
-                    chain = chains.popleft()
-                    gpu = free.popleft()
-                    work = Path(tempfile.mkdtemp(dir=folder))
-                    running.append((_start(chain, gpu, work, site, log), chain, gpu, work))
-                for run in [run for run in running if run[0].poll() is not None]:
-                    _, chain, gpu, work = run
-                    row = json.loads((work / "row.json").read_text())
-                    results.append(output, row)
-                    print(f"{chain.key}: {line(row)}", flush=True)
-                    running.remove(run)
-                    free.append(gpu)
-                    shutil.rmtree(work, ignore_errors=True)
-                time.sleep(POLL_SECONDS)
-        finally:
-            for process, *_ in running:
-                process.terminate()
+def written_row(chain: Chain, code: int, work: Path) -> dict[str, Any]:
+    """Return the row that a chain's process wrote, or one that says that it ended without."""
+    written = work / "row.json"
+    if written.exists():
+        return json.loads(written.read_text("utf8"))
+    return failed(chain, now(), f"the chain ended with code {code} and no row; its process said why.")
 
 
 def _start(chain: Chain, gpu: str | None, work: Path, site: Path | None, log: Path) -> subprocess.Popen[bytes]:
-    environment = dict(os.environ)
-    if gpu is not None:
-        environment["CUDA_VISIBLE_DEVICES"] = gpu
-    checkout = str(Path(__file__).resolve().parents[1])
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, environment.get("PYTHONPATH", "")]))
+    """Start a chain in a session of its own, so that the commands that it runs can be ended with it."""
     spec = json.dumps({**dataclasses.asdict(chain), "photos": str(chain.photos)})
     words = [spec, str(work), str(site.resolve()) if site else "", str(log)]
-    return subprocess.Popen([sys.executable, "-m", "benchmarks.chain", *words], env=environment)
+    command = [sys.executable, "-m", "benchmarks.chain", *words]
+    return subprocess.Popen(command, env=environment_of(gpu), start_new_session=True)
 
 
 def line(row: Mapping[str, Any]) -> str:

@@ -108,8 +108,7 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
     pose = torch.eye(4, device=device)
     pose[:3] = torch.from_numpy(viewmat).to(pose)
     cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
-    degree = splat.degree if splat.degree > 0 else 0
-    image, _, _ = rasterize(splat.gaussians, cameras, RenderOptions(sh_degree=degree, near_plane=NEAR_PLANE))
+    image, _, _ = rasterize(splat.gaussians, cameras, RenderOptions(sh_degree=splat.degree, near_plane=NEAR_PLANE))
     pinhole = image[0].clamp(0, 1).cpu().numpy()
     # OpenCV numbers pixels by their centres.
     at_x = (drawn_x - left - 0.5).astype(np.float32)
@@ -131,14 +130,6 @@ def model_folder(scene: Path) -> Path:
     return scene / "work" / settings["model"]
 
 
-def photo_of(image: str, photos: Sequence[str]) -> str | None:
-    """Return the photo of a model's image, whose name is the photo's, or that and another suffix."""
-    if image in photos:
-        return image
-    without = image.rpartition(".")[0]
-    return without if without in photos else None
-
-
 def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Sequence[str]) -> dict[str, Any]:
     """Compare held-out photos with the file; `names` are all photos, in the order that decides which are held out.
 
@@ -150,7 +141,7 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
     import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-    from benchmarks.chain import held_out
+    from benchmarks.chain import held_out, photo_of
     from benchmarks.evaluate import load_lpips
 
     model = pycolmap.Reconstruction(model_folder(scene))

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as bench
-from benchmarks import protocol, results
+from benchmarks import protocol, results, side_by_side
 from benchmarks.protocol import Job, Row, Scene, set_dotted
 from benchmarks.run import build_config, describe
 from benchmarks.table import markdown
@@ -245,7 +245,7 @@ def test_describe_is_one_sentence():
 
 @pytest.fixture(autouse=True)
 def no_waiting(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bench, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(side_by_side, "POLL_SECONDS", 0.01)
 
 
 class FakeRunner:

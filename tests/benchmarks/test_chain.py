@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import yaml
 from PIL import Image
 from torch.nn import Parameter
 
-from benchmarks import chain, chain_score, chain_table
+from benchmarks import chain, chain_score, chain_table, results, side_by_side
 from examples import simple_trainer
 from examples.drawn_scene.drawing import View, render
 from examples.drawn_scene.scene import SceneDescription, describe_scene
@@ -166,3 +167,37 @@ def test_the_score_falls_when_the_photos_are_blurred_before_training(tmp_path: P
 
 def draw_photo(scene: SceneDescription, view: View) -> np.ndarray:
     return render(scene.surfaces, view)
+
+
+def test_a_chain_that_ends_without_a_row_is_a_failed_one_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    names = ["desk", "lamp"]
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "0.jpg").touch()
+    (tmp_path / "chain.yaml").write_text(yaml.dump({"captures": {name: name for name in names}, "seeds": [0]}))
+    started: list[tuple[str, str | None]] = []
+
+    def start(
+        measured: chain.Chain, gpu: str | None, work: Path, site: Path | None, log: Path
+    ) -> subprocess.Popen[bytes]:
+        started.append((measured.capture, gpu))
+        if measured.capture == "desk":
+            return subprocess.Popen(["false"], start_new_session=True)
+        identity = {"key": measured.key, "lpips": 0.2, "psnr": 30.0, "ssim": 0.9}
+        (work / "row.json").write_text(json.dumps({**row("new", 0, {"a": [30.0, 0.9, 0.2]}), **identity}))
+        return subprocess.Popen(["true"], start_new_session=True)
+
+    monkeypatch.setattr(chain, "_start", start)
+    monkeypatch.setattr(side_by_side, "POLL_SECONDS", 0.01)
+    output = tmp_path / "rows.jsonl"
+    command = chain.Command(tmp_path / "chain.yaml", tmp_path, output, "new", gpus="1")
+    assert command() == 1
+    assert started == [("desk", "1"), ("lamp", "1")]
+    failed, done = results.read(output)
+    assert failed["key"] == "desk/new/0" and failed["status"] == "failed" and "code 1 and no row" in failed["error"]
+    assert done["key"] == "lamp/new/0" and done["status"] == "ok"
+    started.clear()
+    command()
+    assert started == [("desk", "1")], "what is done is not done again"

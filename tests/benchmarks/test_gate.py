@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from benchmarks import __main__ as bench
-from benchmarks import gate, protocol
+from benchmarks import gate, protocol, side_by_side
 from benchmarks.gate import Metric
 from benchmarks.protocol import Job, Row, Scene
 
@@ -121,7 +121,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene = {"data": "fox", "dataparser": "nerfstudio-data"}
     content = {"scenes": {"fox": scene}, "seeds": [0], "rows": [{"label": "ours", "method": "sadgs"}]}
     (tmp_path / "p.yaml").write_text(json.dumps(content))
-    monkeypatch.setattr(bench, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(side_by_side, "POLL_SECONDS", 0.01)
     started: list[str] = []
 
     def run(*options: str, **measured: Any) -> int:
