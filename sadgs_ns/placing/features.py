@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
@@ -16,9 +15,8 @@ from PIL import Image
 
 from sadgs_ns.data.images import image_size
 from sadgs_ns.events import progress
-from sadgs_ns.host_memory import available_host_bytes
 from sadgs_ns.placing.panoramas import VIEWS, rotations
-from sadgs_ns.placing.photos import threads
+from sadgs_ns.placing.photos import threads, threads_in_memory
 
 MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
 MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
@@ -150,5 +148,4 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
 def _num_threads(sizes: Sequence[tuple[int, int]]) -> int:
     """Return how many photos of these sizes in px are searched at a time: one on each core if memory allows."""
     pixels = max((w * h * min(1.0, MAX_SIDE / max(w, h, 1)) ** 2 for w, h in sizes), default=1.0)
-    at_a_time = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
-    return max(1, int(min(os.cpu_count() or 1, at_a_time)))
+    return threads_in_memory(_BYTES_PER_PIXEL * pixels)

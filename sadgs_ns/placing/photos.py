@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import re
 import shutil
 from collections import defaultdict
@@ -16,6 +17,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sadgs_ns.data.images import NOT_UPRIGHT, SIDEWAYS, color_profile
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.host_memory import available_host_bytes
 from sadgs_ns.placing.folder import COLMAP_FORMATS
 from sadgs_ns.placing.panoramas import VIEWS, is_panorama
 
@@ -83,6 +85,12 @@ def threads(number: int | None = None) -> Iterator[ThreadPoolExecutor]:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def threads_in_memory(bytes_of_photo: float) -> int:
+    """Return how many photos are worked on at a time: one on each core, if half of the free memory holds them."""
+    at_a_time = 0.5 * available_host_bytes() / bytes_of_photo
+    return max(1, int(min(os.cpu_count() or 1, at_a_time)))
 
 
 def _read_photo(folder: Path, name: str) -> Photo:

@@ -9,11 +9,11 @@ COLMAP's.
 
 from __future__ import annotations
 
-import os
+import functools
 import shutil
+import threading
 from collections.abc import Callable, Collection
 from concurrent.futures import as_completed
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sadgs_ns.events import progress
-from sadgs_ns.host_memory import available_host_bytes
-from sadgs_ns.placing.photos import threads
+from sadgs_ns.placing.photos import threads, threads_in_memory
 
 MOST_SIDE = 32_766  # Longest side in px that OpenCV warps
 JPEG_QUALITY = 97  # With colours at full resolution; each photo is encoded a second time.
@@ -33,14 +32,6 @@ _JPEG_SUFFIXES = {".jpg", ".jpeg"}
 
 Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 """Takes a photo [H, W, 3] and returns its undistorted image [H', W', 3]."""
-
-
-@dataclass(frozen=True)
-class UndistortedCamera:
-    """The camera of undistorted images, and the way from a photo to one."""
-
-    camera: pycolmap.Camera
-    warp: Warp | None  # None where a side is longer than `MOST_SIDE`
 
 
 def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
@@ -58,14 +49,21 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
     folder = model.with_name("undistorted")
     shutil.rmtree(folder, ignore_errors=True)
     registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
+    registered.sort(key=lambda image: image.camera_id)  # The photos of a camera share its warp.
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
     cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
-    undistorted = {camera_id: undistorted_camera(camera, options) for camera_id, camera in cameras.items()}
+    one_at_a_time = threading.Lock()
+
+    # A warp takes 8 bytes a pixel, and each photo may have a camera of its own.
+    @functools.lru_cache(maxsize=2)
+    def warp_of_camera(camera_id: int) -> Warp | None:
+        return warp_of(cameras[camera_id], options)
 
     def write(name: str, camera_id: int) -> None:
         target = folder / "images" / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        warp = undistorted[camera_id].warp
+        with one_at_a_time:
+            warp = warp_of_camera(camera_id)
         if warp is None:
             write_as_colmap(photos / name, cameras[camera_id], options, target)
         else:
@@ -84,16 +82,20 @@ def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size
             progress("undistorted photos", done, len(registered))
     sparse = folder / "sparse" / "0"
     sparse.mkdir(parents=True)
-    without_distortion(made, {camera_id: new.camera for camera_id, new in undistorted.items()}).write(sparse)
+    undistorted = {key: pycolmap.undistort_camera(options, camera) for key, camera in cameras.items()}
+    without_distortion(made, undistorted).write(sparse)
 
 
-def undistorted_camera(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> UndistortedCamera:
-    """Return COLMAP's camera of undistorted images, and the warp from a photo of `camera` to an image."""
+def warp_of(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> Warp | None:
+    """Return the warp from a photo of `camera` to an image of COLMAP's undistorted camera.
+
+    None if a side is longer than `MOST_SIDE`.
+    """
     final = pycolmap.undistort_camera(options, camera)
     whole_size = pycolmap.UndistortCameraOptions()
     whole = pycolmap.undistort_camera(whole_size, camera)
     if max(camera.width, camera.height, whole.width, whole.height) > MOST_SIDE:
-        return UndistortedCamera(final, None)
+        return None
     map_x, map_y = maps_of(camera, whole)
     size = (final.width, final.height)
 
@@ -104,7 +106,7 @@ def undistorted_camera(camera: pycolmap.Camera, options: pycolmap.UndistortCamer
             image = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
         return np.asarray(image, np.uint8)
 
-    return UndistortedCamera(final, warp)
+    return warp
 
 
 def maps_of(camera: pycolmap.Camera, undistorted: pycolmap.Camera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -125,8 +127,12 @@ def read_pixels(photo: Path) -> NDArray[np.uint8]:
     """Read a photo as it lies in its file, not turned by EXIF, as COLMAP does. RGB [H, W, 3]"""
     pixels = cv2.imread(str(photo), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
-        raise OSError(f"{photo} cannot be read any more: put it back, and run the same command again")
+        raise _missing(photo)
     return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _missing(photo: Path) -> OSError:
+    return OSError(f"{photo} cannot be read any more: put it back, and run the same command again")
 
 
 def write_image(pixels: NDArray[np.uint8], target: Path) -> None:
@@ -144,7 +150,7 @@ def write_as_colmap(
     """Undistort a photo by COLMAP's own interpolation."""
     bitmap = pycolmap.Bitmap.read(photo, as_rgb=True)
     if bitmap is None:
-        raise OSError(f"{photo} cannot be read any more: put it back, and run the same command again")
+        raise _missing(photo)
     pycolmap.undistort_image(options, bitmap, camera)[0].write(target)
 
 
@@ -185,5 +191,4 @@ def without_distortion(made: pycolmap.Reconstruction, cameras: dict[int, pycolma
 def _num_threads(cameras: Collection[pycolmap.Camera]) -> int:
     """Return how many photos are undistorted at a time: one on each core, if memory allows."""
     pixels = max((camera.width * camera.height for camera in cameras), default=1)
-    in_memory = 0.5 * available_host_bytes() / (_BYTES_PER_PIXEL * pixels)
-    return max(1, int(min(os.cpu_count() or 1, in_memory)))
+    return threads_in_memory(_BYTES_PER_PIXEL * pixels)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sadgs_ns.placing import undistortion
-from sadgs_ns.placing.undistortion import read_pixels, undistorted_camera, without_distortion, write_image
+from sadgs_ns.placing.undistortion import read_pixels, warp_of, without_distortion, write_image
 
 WIDTH, HEIGHT = 360, 240
 SAMPLES = 4
@@ -63,12 +63,13 @@ def test_images_keep_the_detail_of_their_photos(reduction: float):
     camera = lens()
     max_size = -1 if reduction == 1 else round(WIDTH / reduction)
     options = pycolmap.UndistortCameraOptions(max_image_size=max_size)
-    new = undistorted_camera(camera, options)
+    undistorted = pycolmap.undistort_camera(options, camera)
+    warp = warp_of(camera, options)
     period = 3.0 * reduction / camera.focal_length_x  # The finest wave has 3 px in the image.
     photo = photograph(camera, period)
-    truth = photograph(new.camera, period)
-    assert new.warp is not None
-    image = new.warp(photo)
+    truth = photograph(undistorted, period)
+    assert warp is not None
+    image = warp(photo)
     bilinear = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(photo), camera)[0].to_array()
     assert image.shape == truth.shape == bilinear.shape
     assert 0.9 <= energy(image) / energy(truth) <= 1.05
@@ -79,7 +80,7 @@ def test_a_step_overshoots_little():
     camera = lens()
     photo = np.full((HEIGHT, WIDTH, 3), 60, np.uint8)
     photo[:, WIDTH // 2 :] = 190
-    warp = undistorted_camera(camera, pycolmap.UndistortCameraOptions()).warp
+    warp = warp_of(camera, pycolmap.UndistortCameraOptions())
     assert warp is not None
     image = warp(photo).astype(int)
     assert image.min() >= 60 - 13 and image.max() <= 190 + 13, "a tenth of the step"
@@ -88,18 +89,55 @@ def test_a_step_overshoots_little():
 def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
     camera = lens()
     options = pycolmap.UndistortCameraOptions(max_image_size=200)
-    new = undistorted_camera(camera, options)
-    assert new.camera.params.tolist() == pycolmap.undistort_camera(options, camera).params.tolist()
+    undistorted = pycolmap.undistort_camera(options, camera)
+    warp = warp_of(camera, options)
     ray = np.array([[0.21, -0.13, 1.0]])
     x, y = np.asarray(camera.img_from_cam(ray))[0]
     grid_y, grid_x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     spot = np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / (2 * 3.0**2))
-    assert new.warp is not None
+    assert warp is not None
     photo = (255 * spot).astype(np.uint8)[..., None].repeat(3, axis=2)
-    image = new.warp(photo)[..., 0].astype(float)
+    image = warp(photo)[..., 0].astype(float)
     at_y, at_x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     found = np.array([(at_x * image).sum(), (at_y * image).sum()]) / image.sum()
-    np.testing.assert_allclose(found, np.asarray(new.camera.img_from_cam(ray))[0], atol=0.05)
+    np.testing.assert_allclose(found, np.asarray(undistorted.img_from_cam(ray))[0], atol=0.05)
+
+
+def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Photos of two sizes lie in turns, and a third camera has a photo that was undistorted before."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    made = pycolmap.Reconstruction()
+    cameras = {1: lens(-0.12, 90, 60), 2: lens(0.1, 60, 90), 3: lens(-0.1, 80, 50)}
+    for camera_id, camera in cameras.items():
+        camera.camera_id = camera_id
+        made.add_camera_with_trivial_rig(camera)
+    for image_id, camera_id in enumerate([1, 2, 1, 2, 3], 1):
+        name = f"{image_id}.png"
+        Image.fromarray(photograph(cameras[camera_id], 0.1)).save(photos / name)
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    asked: list[tuple[int, int]] = []
+
+    def counted(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> undistortion.Warp | None:
+        asked.append((camera.width, camera.height))
+        return warp_of(camera, options)
+
+    monkeypatch.setattr(undistortion, "warp_of", counted)
+    undistortion.undistort(photos, tmp_path / "model", made, 0, {"5.png"})
+    assert asked == [(90, 60), (60, 90)]
+    model = pycolmap.Reconstruction(tmp_path / "undistorted" / "sparse" / "0")
+    options = pycolmap.UndistortCameraOptions()
+    for camera_id, camera in cameras.items():
+        expected = pycolmap.undistort_camera(options, camera)
+        assert model.cameras[camera_id].params.tolist() == expected.params.tolist()
+    written = sorted((tmp_path / "undistorted" / "images").iterdir())
+    assert [file.name for file in written] == ["1.png", "2.png", "3.png", "4.png"]
+    for file in written:
+        camera = cameras[made.images[int(file.stem)].camera_id]
+        warp = warp_of(camera, options)
+        assert warp is not None
+        np.testing.assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
 
 
 def test_keypoints_of_the_model_move_with_the_images():
@@ -130,4 +168,4 @@ def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):
 
 def test_photos_too_large_for_opencv_go_colmap_s_way(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(undistortion, "MOST_SIDE", WIDTH - 1)
-    assert undistorted_camera(lens(), pycolmap.UndistortCameraOptions()).warp is None
+    assert warp_of(lens(), pycolmap.UndistortCameraOptions()) is None
