@@ -99,11 +99,17 @@ class Peers:
             time.sleep(0.2)
         raise SystemExit(0)
 
+    def forget(self) -> None:
+        """Look at no other process any more: they exit, and this one goes on without them."""
+        self._places = []
+
     def ended(self) -> bool:
         """Tell whether a process of this machine ended, after waiting some seconds for one."""
         end = time.monotonic() + _REAPED_SECONDS
         here = socket.gethostname()
         process_ids = [process_id for host, process_id in self._places if host == here]
+        if not process_ids:
+            return False
         while all(_exists(process_id) for process_id in process_ids):
             if time.monotonic() > end:
                 return False
@@ -167,6 +173,7 @@ def continue_on_rank_zero(world: World, peers: Peers) -> None:
     dist.destroy_process_group()
     if world.rank > 0:
         peers.exit_after_rank_zero()
+    peers.forget()
     os.environ.pop("LOCAL_WORLD_SIZE", None)  # torchrun set it; nobody shares the host's memory any more.
     # nerfstudio leaves a process group at the end, so there must be one.
     store = dist.HashStore()  # pyright: ignore[reportPrivateImportUsage]
