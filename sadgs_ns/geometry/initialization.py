@@ -6,8 +6,6 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, far_outliers
-
 FACE_GRID = 16
 """Points along each side of a face (released code)."""
 FACE_OPACITY = 0.05
@@ -57,11 +55,6 @@ def neighbour_scales(points: Tensor) -> Tensor:
     return torch.from_numpy(distances[:, 1:].mean(1)).to(points).clamp_min(1e-6 * extent)
 
 
-def plausible_points(points: Tensor, share: float = POINT_SHARE) -> Tensor:
-    """Tell which SfM points, or cameras, count: all but `outliers.far_outliers` with this share. [P, 3] → bool [P]"""
-    return ~torch.from_numpy(far_outliers(points.detach().cpu().numpy(), share)).to(points.device)
-
-
 def starting_points(
     points: Tensor,  # [P, 3]
     colors: Tensor,  # [P, 3]
@@ -84,13 +77,3 @@ def starting_points(
         torch.cat([scales, torch.full((len(added),), spacing)]),
         torch.cat([opacities, torch.full((len(added),), FACE_OPACITY)]),
     )
-
-
-def camera_extent(positions: Tensor) -> float:
-    """The extent of cameras at positions [C, 3]: 1.1 times the largest distance from their centre (3DGS).
-
-    Cameras that lie absurdly far from the others (`outliers.far_outliers`) do not count. It is 1 where all coincide.
-    """
-    positions = positions[plausible_points(positions, CAMERA_SHARE)]
-    extent = 1.1 * float((positions - positions.mean(0)).norm(dim=-1).max())
-    return extent if extent > 0 else 1.0

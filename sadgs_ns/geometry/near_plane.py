@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
-from sadgs_ns.geometry.initialization import plausible_points
+from sadgs_ns.geometry.extents import plausible_points
+from sadgs_ns.geometry.view_depths import depths_in_views
 
 NEAREST_POINTS = 5  # A view's fifth nearest SfM point is trusted; the four that are nearer may be errors
 NEAR_SHARE = 0.5
@@ -29,7 +29,7 @@ def scene_near_plane(
     sizes: Tensor,  # [C, 2]
     extent: float,
 ) -> float:
-    """Derive the near plane of a scene, > 0, given arguments of `depths_in_views` and `initialization.camera_extent`.
+    """Derive the near plane of a scene, > 0, given arguments of `depths_in_views` and `extents.camera_extent`.
 
     The training camera whose `NEAREST_POINTS`-th nearest SfM point has the least depth decides.
     """
@@ -40,15 +40,3 @@ def scene_near_plane(
         depths = (depths_in_views(points, *some) for some in zip(*cameras, strict=True))  # each [c, P]
         nearest = min(float(some.kthvalue(NEAREST_POINTS, dim=1).values.min()) for some in depths)
     return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent
-
-
-def depths_in_views(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
-    """Depths of points [P, 3] along the viewing axes of cameras (`render.types.Cameras`), infinite outside the image.
-
-    `sizes` are the images' widths and heights in px [C, 2]. [C, P]
-    """
-    viewmats, Ks, sizes = viewmats.to(points), Ks.to(points), sizes.to(points)
-    projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
-    x, y, depths = projected.unbind(dim=1)
-    inside = (x >= 0) & (x <= sizes[:, :1] * depths) & (y >= 0) & (y <= sizes[:, 1:] * depths) & (depths > 0)
-    return torch.where(inside, depths, torch.inf)

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sadgs_ns.geometry.near_plane import depths_in_views
+from sadgs_ns.geometry.view_depths import depths_in_views
 
 WORKING_SIDE = 800  # Longest side in px at which depth is computed; larger images are reduced: time grows with the area
 LEVELS = 3  # Levels of the image pyramid. Each has half the sides of the one before

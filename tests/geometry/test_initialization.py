@@ -5,13 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.geometry.initialization import (
-    bounding_box_points,
-    camera_extent,
-    neighbour_scales,
-    plausible_points,
-    starting_points,
-)
+from sadgs_ns.geometry.extents import camera_extent, plausible_points
+from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales, starting_points
 
 
 def test_points_lie_on_the_six_faces():
