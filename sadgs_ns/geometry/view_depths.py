@@ -6,13 +6,24 @@ import torch
 from torch import Tensor
 
 
-def depths_in_views(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
-    """Depths of points [P, 3] along the viewing axes of cameras (`render.types.Cameras`), infinite outside the image.
+def depths_in_views(
+    points: Tensor,  # [P, 3]
+    viewmats: Tensor,  # [C, 4, 4] world to camera
+    Ks: Tensor,  # [C, 3, 3] px
+    sizes: Tensor,  # [C, 2] widths and heights of the images in px
+) -> Tensor:
+    """Depths of points along the viewing axes of cameras, in world units, infinite outside the image. [C, P]
 
-    `sizes` are the images' widths and heights in px [C, 2]. [C, P]
+    They have the type of the points, and lie on their device.
     """
-    viewmats, Ks, sizes = viewmats.to(points), Ks.to(points), sizes.to(points)
-    projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
-    x, y, depths = projected.unbind(dim=1)
-    inside = (x >= 0) & (x <= sizes[:, :1] * depths) & (y >= 0) & (y <= sizes[:, 1:] * depths) & (depths > 0)
+    viewmats = viewmats.to(points)
+    Ks = Ks.to(points)
+    sizes = sizes.to(points)
+    rotations = viewmats[:, :3, :3]
+    translations = viewmats[:, :3, 3:]
+    projected = (Ks @ rotations) @ points.T + Ks @ translations  # [C, 3, P]
+    x, y, depths = projected.unbind(dim=1)  # x and y are px times depth.
+    inside_x = (x >= 0) & (x <= sizes[:, :1] * depths)
+    inside_y = (y >= 0) & (y <= sizes[:, 1:] * depths)
+    inside = inside_x & inside_y & (depths > 0)
     return torch.where(inside, depths, torch.inf)
