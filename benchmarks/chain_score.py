@@ -74,7 +74,9 @@ def read_photo(file: Path, max_size: int) -> Array:
     height, width = pixels.shape[:2]
     scale = min(1.0, max_size / max(width, height)) if max_size else 1.0
     size = (round(scale * width), round(scale * height))
-    return pixels if scale == 1 else cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
+    if scale == 1:
+        return pixels
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
 @torch.no_grad()
@@ -166,12 +168,13 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
         size = (photo.shape[1], photo.shape[0])
         drawn = draw(splat, image.camera, image.cam_from_world().matrix(), size)
         pair = [torch.from_numpy(pixels).movedim(-1, 0)[None].to(device) for pixels in (drawn, photo)]
-        psnr = float(peak_signal_noise_ratio(*pair, data_range=1.0))
-        ssim: Any = structural_similarity_index_measure(*pair, data_range=1.0, sigma=1.5, kernel_size=11)
+        rendered, truth = pair
+        psnr = float(peak_signal_noise_ratio(rendered, truth, data_range=1.0))
+        ssim: Any = structural_similarity_index_measure(rendered, truth, data_range=1.0, sigma=1.5, kernel_size=11)
         lpips = None
         if network is not None:
             with torch.no_grad():
-                lpips = round(float(network(*pair)), 4)
+                lpips = round(float(network(rendered, truth)), 4)
         views[name] = [round(psnr, 3), round(float(ssim), 4), lpips]
     columns = list(zip(*views.values(), strict=True))
     return {

@@ -385,8 +385,9 @@ def tiles() -> Results:
         projected.radii[:, 1] = 2000  # These cover all 1,200 tiles, and are listed in parts.
         projected.conics[:, 1] = torch.tensor([1e-6, 0.0, 1e-6])
         projected.opacities[:, 1] = 0.5
-        options = {"width": size[0], "height": size[1], "tile_size": TILE_SIZE}
-        options["max_off_axis"] = 1.2 if per_axis else 0.0
+        options: dict[str, Any] = {"width": size[0], "height": size[1], "tile_size": TILE_SIZE, "max_off_axis": 0.0}
+        if per_axis:
+            options["max_off_axis"] = 1.2
         pending = intersect_tiles(**projected._asdict(), **options)
         case = f"radius per axis {per_axis}"
         found[f"{case}: order"] = pending.order

@@ -81,7 +81,8 @@ class ColmapParser(ColmapDataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
         outputs = super()._generate_dataparser_outputs(split, **options)
-        return undo_centring(outputs, self._middle)
+        undo_centring(outputs, self._middle)
+        return outputs
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         config = self.config

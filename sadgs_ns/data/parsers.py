@@ -51,8 +51,13 @@ def choose_parser(config: FullImageDatamanagerConfig) -> None:
     if layout == "blender":
         config.dataparser = BlenderDataParserConfig(data=data)
     elif layout == "colmap":
-        options = vars(automatic_options(data))
-        chosen = ("colmap_path", "images_path", "downscale_factor", "downscale_rounding_mode")
-        config.dataparser = ColmapDataParserConfig(data=data, **{name: options[name] for name in chosen})
+        options = automatic_options(data)
+        config.dataparser = ColmapDataParserConfig(
+            data=data,
+            colmap_path=options.colmap_path,
+            images_path=options.images_path,
+            downscale_factor=options.downscale_factor,
+            downscale_rounding_mode=options.downscale_rounding_mode,
+        )
     else:
         config.dataparser = NerfstudioDataParserConfig(data=data, load_3D_points=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
 
-_FAR = 10.0  # Distance of cameras from the origin, in their extents, from which `centre_poses` moves them
+_FAR = 10.0  # Poses farther from the origin than so many of their extents are centred.
 
 
 class Centring(NamedTuple):
@@ -32,7 +32,7 @@ def centre_poses(meta: Mapping[str, Any], method: str) -> Centring:
     and the cameras are so far away that this rounds coarsely.
     """
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float64)  # [V, 4, 4]
-    middle = np.median(poses[:, :3, 3], axis=0)
+    middle = np.median(poses[:, :3, 3], axis=0)  # [3]
     distance = np.abs(middle).max()
     extent = np.ptp(poses[:, :3, 3], axis=0).max()
     if method == "none" and distance > 1000 * extent:
@@ -46,28 +46,36 @@ def centre_poses(meta: Mapping[str, Any], method: str) -> Centring:
     return Centring(middle, np.linalg.pinv(applied[:, :3]) @ middle)
 
 
-def undo_centring(outputs: DataparserOutputs, middle: NDArray[np.float64]) -> DataparserOutputs:
-    """Return outputs whose transform maps the data of before a translation [3], in float64 if there was one."""
-    if middle.any():
-        found = Similarity.of(outputs.dataparser_transform.double().numpy())
-        linear = found.scale * found.orthogonal
-        outputs.dataparser_transform = torch.from_numpy(np.c_[linear, found.translation - linear @ middle])
-    return outputs
+def undo_centring(outputs: DataparserOutputs, middle: NDArray[np.float64]) -> None:
+    """Make the outputs' transform one of the data as they were before a translation by −`middle` [3].
+
+    It is in float64 if there was such a translation.
+    """
+    if not middle.any():
+        return
+    of_centred = Similarity.of(outputs.dataparser_transform.double().numpy())
+    linear = of_centred.scale * of_centred.orthogonal  # [3, 3]
+    translation = of_centred.translation - linear @ middle
+    outputs.dataparser_transform = torch.from_numpy(np.column_stack([linear, translation]))
 
 
 def move_to_fixed_frame(outputs: DataparserOutputs, meta: dict[str, Any], path: Path) -> None:
     """Move a parser's cameras and points to the frame that the content of a `transforms.json` fixes, if it does."""
-    if (fixed := fixed_frame(meta, path)) is None:
+    fixed = fixed_frame(meta, path)
+    if fixed is None:
         return
     chosen = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
-    cameras, metadata = outputs.cameras, outputs.metadata
-    poses = fixed.poses(chosen.inverse().poses(cameras.camera_to_worlds.double().numpy()))
-    cameras.camera_to_worlds = torch.from_numpy(poses).float()
+    to_data = chosen.inverse()
+    cameras = outputs.cameras
+    poses = to_data.poses(cameras.camera_to_worlds.double().numpy())
+    cameras.camera_to_worlds = torch.from_numpy(fixed.poses(poses)).float()
+    metadata = outputs.metadata
     if "points3D_xyz" in metadata:
-        points = metadata["points3D_xyz"].double().numpy()
-        metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(chosen.inverse().positions(points))).float()
-    outputs.dataparser_transform = torch.tensor(meta[FRAME_KEYS[0]], dtype=outputs.dataparser_transform.dtype)
-    outputs.dataparser_scale = float(meta[FRAME_KEYS[1]])
+        points = to_data.positions(metadata["points3D_xyz"].double().numpy())
+        metadata["points3D_xyz"] = torch.from_numpy(fixed.positions(points)).float()
+    transform, scale = (meta[key] for key in FRAME_KEYS)
+    outputs.dataparser_transform = torch.tensor(transform, dtype=outputs.dataparser_transform.dtype)
+    outputs.dataparser_scale = float(scale)
 
 
 def points_in_the_run(
@@ -79,5 +87,6 @@ def points_in_the_run(
     """
     with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite, and are left out later.
         positions = positions.astype(np.float32)
-    homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))
-    return {"points3D_xyz": homogeneous @ transform.T * scale, "points3D_rgb": torch.from_numpy(colors)}
+    homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))  # [P, 4]
+    placed = homogeneous @ transform.T * scale  # [P, 3]
+    return {"points3D_xyz": placed, "points3D_rgb": torch.from_numpy(colors)}

@@ -90,7 +90,7 @@ class TransformsParser(Nerfstudio):
                 **points,
             },
         )
-        outputs = undo_centring(outputs, centring.of_data)
+        undo_centring(outputs, centring.of_data)
         move_to_fixed_frame(outputs, meta, path)
         return outputs
 

@@ -39,7 +39,8 @@ class Photo:
     @property
     def views(self) -> list[Photo]:
         """The views that a panorama is cut into, without a camera of their own; another photo is its own view."""
-        suffix, size = "png" if self.has_alpha else "jpg", (self.size[1] // 2, self.size[1] // 2)
+        suffix = "png" if self.has_alpha else "jpg"
+        size = (self.size[1] // 2, self.size[1] // 2)
         names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
         return [Photo(name, size, (), self.has_alpha) for name in names] if self.is_panorama else [self]
 

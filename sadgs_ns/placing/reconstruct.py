@@ -74,14 +74,16 @@ def make_model(
         rigs: The names of the views of each panorama.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
+    names = sorted(itertools.chain(*groups, *rigs))
+    database = model.with_name("database.db")
     gpu, nerfstudio = begin_imports()
     if not model.exists():
         extract(photos, groups, database, rigs)
         match(names, database, matching, gpu.result(), rigs)
         place_cameras(photos, names, database, model, base)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
-    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+    made = pycolmap.Reconstruction(model)
+    undistorted = model.with_name("undistorted")
     undistort(photos, model, made, max_size, known)
     check_written(undistorted / "sparse" / "0", made)
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
@@ -112,7 +114,8 @@ def wake_gpu() -> torch.device | None:
 
 def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
     """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
-    described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
+    described = json.loads(file.read_text())
+    first = {view: views[0] for views in rigs for view in views}
     names = in_order([frame["file_path"] for frame in described["frames"]])
     whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
     chosen = list(dict.fromkeys(whole.values()))[4::10]
@@ -128,8 +131,10 @@ def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: 
     The views of a panorama, which have one centre, are not paired with each other. With "sequential" only those views
     of two panoramas are paired that look the same way, and fewer follow, because a panorama overlaps with many.
     """
-    in_turn, units = matching == "sequential", {views[0]: views for views in rigs}
-    first, axes = {view: views[0] for views in rigs for view in views}, rotations()[:, :, 2]
+    in_turn = matching == "sequential"
+    units = {views[0]: views for views in rigs}
+    first = {view: views[0] for views in rigs for view in views}
+    axes = rotations()[:, :, 2]
     order = list(dict.fromkeys(first.get(name, name) for name in (in_order(names) if in_turn else names)))
     pairs: list[tuple[str, str]] = []
     for a, b in sequential_pairs(order, 2 if rigs else 10) if in_turn else itertools.combinations(order, 2):
@@ -155,7 +160,8 @@ def match(
     """
     from sadgs_ns.placing.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
 
-    stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
+    stage = f"matches ({matching})"
+    pair_list = database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
@@ -331,7 +337,8 @@ def summarize(
     names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
 ) -> Summary:
     """Count the registered photos, and find out why the others are none."""
-    registered, left_out = registered_photos(model), {}
+    registered = registered_photos(model)
+    left_out = {}
     with pycolmap.Database.open(database) as opened:
         identities = {image.name: image.image_id for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()

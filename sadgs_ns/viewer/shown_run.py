@@ -106,7 +106,7 @@ class StructureTensors(Protocol):
         """Load the photos, and compute S̄ of those for which there is room."""
         ...
 
-    def photo(self, data: Mapping[str, Any]) -> Tensor:
+    def photo(self, data: Mapping[str, Any], /) -> Tensor:
         """Return an image of the datamanager as the loss sees it. [H, W, 3]"""
         ...
 

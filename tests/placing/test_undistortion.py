@@ -95,7 +95,8 @@ def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
     grid_y, grid_x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     spot = np.exp(-((grid_x - x) ** 2 + (grid_y - y) ** 2) / (2 * 3.0**2))
     assert new.warp is not None
-    image = new.warp(np.uint8(255 * spot)[..., None].repeat(3, axis=2))[..., 0].astype(float)
+    photo = (255 * spot).astype(np.uint8)[..., None].repeat(3, axis=2)
+    image = new.warp(photo)[..., 0].astype(float)
     at_y, at_x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     found = np.array([(at_x * image).sum(), (at_y * image).sum()]) / image.sum()
     np.testing.assert_allclose(found, np.asarray(new.camera.img_from_cam(ray))[0], atol=0.05)

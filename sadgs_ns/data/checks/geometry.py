@@ -73,13 +73,15 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
 
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
-    width, height = camera.width, camera.height
+    width = camera.width
+    height = camera.height
     off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
     if off > 0.5 or max(camera.cx, camera.cy) <= 1:  # The latter are shares of the image, or were not known.
         place = f"{'outside' if off > 0.5 else 'in a corner of'} its image of {width} × {height} px"
         center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, {place}"
         yield (fault if off > _FARTHEST_CENTER else warning)(f"{where} has {center}: correct cx and cy, in pixels.")
-    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
+    half_width = width / 2 / camera.fx
+    half_height = height / 2 / camera.fy
     angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
     if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
         focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
@@ -146,7 +148,8 @@ def check_points(points: colmap.Points, views: Sequence[View], path: Path, remed
 
 def _check_colors(points: colmap.Points, views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
     every = slice(None, None, len(points[0]) // 10_000 + 1)
-    positions, colors = points[0][every], points[1][every]
+    positions = points[0][every]
+    colors = points[1][every]
     with ThreadPoolExecutor() as pool:  # Pillow decodes in threads.
         found = pool.map(lambda view: _fit(positions, colors, view), views[:: len(views) // 8 + 1])
         fits = [fit for fit in found if fit is not None]

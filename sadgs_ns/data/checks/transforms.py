@@ -39,8 +39,10 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     path = transforms_path(data)
     if not path.is_file():
         raise InputError(no_layout(data))
-    folder, meta = path.parent, read_transforms(path)
-    described, model = meta["frames"], meta.get("camera_model", "OPENCV")
+    folder = path.parent
+    meta = read_transforms(path)
+    described = meta["frames"]
+    model = meta.get("camera_model", "OPENCV")
     if model not in (known := (*PERSPECTIVE, "OPENCV_FISHEYE", "FISHEYE624")):
         raise InputError(f"{path} has the camera model {model!r}: give one of {', '.join(known)}.")
     _check_transform(meta, path)
@@ -49,9 +51,11 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     def locate(name: str, kind: str = "images") -> Path:
         return folder / (f"{kind}_{factor}/{Path(name).name}" if factor > 1 else name)  # Copies lie in one folder.
 
-    frames, views = [], []
+    frames = []
+    views = []
     for frame in described:
-        where, mask = f"{path}: frame {frame['file_path']}", frame.get("mask_path")
+        where = f"{path}: frame {frame['file_path']}"
+        mask = frame.get("mask_path")
         check_positive(frame, where, PINHOLE)
         image = locate(frame["file_path"])
         size = images.scaled_size((int(frame["w"]), int(frame["h"])), factor, "floor")
@@ -79,7 +83,11 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
 def _factor_of(described: Sequence[dict[str, Any]], folder: Path, options: ParserOptions) -> int:
     """Return the downscale factor of the frames' images to read; raise InputError if these or masks are missing."""
     first = folder / described[0]["file_path"]
-    factor, copies = options.downscale_factor, lambda by: images.smaller_folder(folder / "images", by) / first.name
+    factor = options.downscale_factor
+
+    def copies(by: int) -> Path:
+        return images.smaller_folder(folder / "images", by) / first.name
+
     if factor is None and not first.is_file() and (there := [by for by in (2, 4, 8) if copies(by).is_file()]):
         told = f"{first} does not exist, but {copies(there[0])} does"  # Some captures are shared smaller.
         raise InputError(f"{told}: end the command with `nerfstudio-data --downscale-factor {there[0]}`.")
@@ -158,7 +166,8 @@ def _check_ply(meta: dict[str, Any], path: Path, views: Sequence[View]) -> Itera
         remedy = f"restore it, or remove ply_file_path from {path} to start from random points"
         yield from geometry.check_ply(path.parent / str(meta["ply_file_path"]), views, remedy)
     elif (source := colmap.points_file(path.parent / COLMAP_FOLDERS[0])) is not None:
-        (positions, colors), transform = colmap.read_points(source), np.array(meta["applied_transform"], float)
+        (positions, colors) = colmap.read_points(source)
+        transform = np.array(meta["applied_transform"], float)
         points = positions @ transform[:, :3].T + transform[:, 3], colors
         random = "end the command with `nerfstudio-data --load-3D-points False` to start from random points"
         yield from geometry.check_points(points, views, source, f"run COLMAP's mapper again, or {random}")

@@ -44,7 +44,7 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
         pipeline.clear_paths(near_plane)
     length = plan_length(config, len(pipeline.views), before)
     world, peers = choose_processes(config, pipeline, length, world, peers)
-    if world.num_ranks > 1:
+    if not world.alone:
         turn_viewer_off(config)
         pipeline.model.shard(world)
     start_step = 0

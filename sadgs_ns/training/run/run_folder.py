@@ -51,26 +51,36 @@ def write_config(config: TrainerConfig) -> Path:
 def _check_folder(config: TrainerConfig) -> None:
     """Raise InputError if the run would delete checkpoints of an earlier run in the same folder."""
     folder = config.get_checkpoint_dir()
-    there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
-    start = config.load_dir if config.load_checkpoint is None else config.load_checkpoint.parent
-    if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
-        raise InputError(
-            f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
-            f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
-        )
+    if not os.path.isdir(folder):
+        return
+    present = sorted(folder.glob("step-*.ckpt"))
+    if not present:
+        return
+    start = config.load_dir
+    if config.load_checkpoint is not None:
+        start = config.load_checkpoint.parent
+    if start is not None and start.resolve() in (folder.resolve(), folder.parent.resolve()):
+        return  # The run goes on from these checkpoints.
+    raise InputError(
+        f"{folder} holds {present[-1].name} of an earlier run, which this run would delete: go on from it with "
+        f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
+    )
 
 
 def _check_address(viewer: ViewerConfig) -> None:
     """Raise InputError if the viewer cannot listen at its address; viser would take another port, or never return."""
-    host, port = viewer.websocket_host, viewer.websocket_port
+    port = viewer.websocket_port or 0
+    address = viewer.websocket_host
+    if port:
+        address = f"{address}:{port}"
     try:
-        places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        for family, _, _, _, address in places:
-            socket.create_server(address, family=family).close()
+        found = socket.getaddrinfo(viewer.websocket_host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        for family, _, _, _, socket_address in found:
+            socket.create_server(socket_address, family=family).close()
     except OSError as error:
         problem = reason(error).partition(" (while")[0]
         raise InputError(
-            f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({problem}): give another "
+            f"The viewer cannot listen on {address} ({problem}): give another "
             "viewer.websocket_port, or none for a free one, or another viewer.websocket_host: 127.0.0.1 opens the "
             "viewer to this machine only, 0.0.0.0 to the network."
         ) from error

@@ -74,10 +74,12 @@ class RunPlan:
         """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
         planned = {}
         for name, rate in self.rates.items():
-            group, decay = configs[name], asdict(rate)
+            group = configs[name]
+            decay = asdict(rate)
             optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
-            ours = decay["max_steps"] is not None
-            scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")
+            scheduler = group.get("scheduler")
+            if rate.max_steps is not None:
+                scheduler = RunLengthDecaySchedulerConfig(**decay)
             planned[name] = {"optimizer": optimizer, "scheduler": scheduler}
         return planned
 
@@ -121,9 +123,14 @@ def plan_rates(
     """
     rates = {}
     for name, group in configs.items():
-        lr, decay = group["optimizer"].lr, group.get("scheduler")
-        factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
-        start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)
+        lr = group["optimizer"].lr
+        decay = group.get("scheduler")
+        start = 1.0
+        end = 1.0
+        if follow_views and name in RATES_OF_FOUR_VIEWS:
+            start_of_four, end_of_four = RATES_OF_FOUR_VIEWS[name]
+            start = between_one_and_four(length.views_per_iteration, start_of_four)
+            end = between_one_and_four(length.views_per_iteration, end_of_four)
         lr *= start
         if name == "means":
             lr *= extent
@@ -135,6 +142,8 @@ def plan_rates(
         final = decay.final_factor * (end / start)
         if follow_views and decay.hold_share > 0:
             final *= between_one_and_four(length.views_per_iteration, 1 / final)
-        steps = length.iterations if decay.max_steps is None else decay.max_steps
+        steps = decay.max_steps
+        if steps is None:
+            steps = length.iterations
         rates[name] = Rate(lr, decay.initial_factor, final, decay.hold_share, steps)
     return rates
