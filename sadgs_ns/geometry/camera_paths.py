@@ -80,14 +80,17 @@ class CameraPaths:
         """Tell which Gaussians are haze near a path; one whose centre is not finite is not. bool [N]"""
         from_path = self._distances_from_paths(means)
         is_near = from_path < self.reach
-        is_long = scales.amax(dim=1) > HAZE_LENGTH * from_path
+        longest_axes = scales.amax(1)
+        is_long = longest_axes > HAZE_LENGTH * from_path
         haze = is_near & is_long
         found = haze.nonzero()[:, 0]
         from_path = from_path[found]
         from_surface, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
-        is_alone = torch.from_numpy(from_surface).to(means) > SUPPORT * from_path
+        from_surface = torch.from_numpy(from_surface).to(means)
+        is_alone = from_surface > SUPPORT * from_path
         second_axes = scales[found].median(dim=1).values
-        haze[found] = is_alone | (second_axes > TOO_WIDE * from_path)
+        is_wide = second_axes > TOO_WIDE * from_path
+        haze[found] = is_alone | is_wide
         return haze
 
     def _distances_from_paths(self, means: Tensor) -> Tensor:
@@ -130,7 +133,8 @@ def _connect_neighbours(
     distances.fill_diagonal_(torch.inf)
     nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
     usual = float(nearest.values[:, :1].median())  # NaN for a single camera
-    longest = LONGEST * max(near_plane, usual)
+    unit = max(near_plane, usual)
+    longest = LONGEST * unit
     cameras = torch.arange(len(centres))[:, None]
     pairs = torch.stack([cameras.expand_as(nearest.indices), nearest.indices], dim=-1)
     pairs = pairs[nearest.values < longest]
@@ -156,14 +160,18 @@ def _find_paths(
 
     A cube around all paths is halved again and again, without the parts that no path comes so near to.
     """
-    corner = starts.amin(dim=0) - reach
-    extents = starts.amax(dim=0) + reach - corner
+    lowest = starts.amin(0)
+    highest = starts.amax(0)
+    corner = lowest - reach
+    extents = highest + reach - corner
     side = float(extents.max())
-    smallest = max(reach, side / _CUBES)
+    finest = side / _CUBES
+    smallest = max(reach, finest)
     halves = torch.tensor([-0.5, 0.5], device=starts.device)
     octants = torch.cartesian_prod(halves, halves, halves)  # [8, 3]
     # Pairs of a cube, by its middle, and a path.
-    middles = (corner + side / 2).expand_as(starts)
+    middle = corner + side / 2
+    middles = middle.expand_as(starts)
     paths = torch.arange(len(starts), device=starts.device)
     while side > smallest and len(paths) <= _PAIRS // 4:
         side /= 2
@@ -177,12 +185,15 @@ def _find_paths(
     places = _cube_numbers(positions, corner, side)
     firsts = torch.searchsorted(listed, places)
     ends_of_lists = torch.searchsorted(listed, places, right=True)
-    return _NearbyPaths(ends_of_lists - firsts, firsts, paths[order])
+    counts = ends_of_lists - firsts
+    return _NearbyPaths(counts, firsts, paths[order])
 
 
 def _cube_numbers(positions: Tensor, corner: Tensor, side: float) -> Tensor:
     """Number the cubes of a grid from `corner` [3] in which positions [N, 3] lie, alike outside the grid. int64 [N]"""
-    places = ((positions - corner) / side).nan_to_num(-1.0)
+    from_corner = positions - corner
+    places = from_corner / side
+    places = places.nan_to_num(-1.0)
     x, y, z = places.clamp(-1, _CUBES).floor().long().unbind(dim=1)
     return (x * (_CUBES + 2) + y) * (_CUBES + 2) + z
 
@@ -196,5 +207,7 @@ def _distances(
     ways = ends - starts
     away = positions - starts
     squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
-    along = ((away * ways).sum(dim=1) / squares).clamp(0, 1)  # Nearest place of the path, 0 at its start
+    products = (away * ways).sum(dim=1)
+    along = products / squares
+    along = along.clamp(0, 1)  # Nearest place of the path: 0 is its start, and 1 its end.
     return torch.addcmul(away, along[:, None], ways, value=-1).norm(dim=1)

@@ -78,7 +78,8 @@ def dense_points(
     chance = torch.rand(len(means), generator=generator, device=device)
     enough = agreeing >= AGREEING_VIEWS
     # Every view that agrees draws points of the same surface.
-    stays = enough & (chance < AGREEING_VIEWS / agreeing.clamp_min(1))
+    share = AGREEING_VIEWS / agreeing.clamp_min(1)
+    stays = enough & (chance < share)
     chosen = stays.nonzero()[:, 0]
     order = torch.randperm(len(chosen), generator=generator, device=device)
     chosen = chosen[order[:number]]
@@ -117,7 +118,8 @@ def _candidates(
     depth = depths.depth[rows, columns][known]
     focal = depths.K.diagonal()[:2]
     centre = depths.K[:2, 2]
-    rays = (pixels[known] - centre) / focal
+    from_centre = pixels[known] - centre
+    rays = from_centre / focal
     in_camera = torch.cat([rays * depth[:, None], depth[:, None]], dim=1)
     means = (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
     scales = SCALE * local * depth / depths.K[0, 0]
@@ -135,12 +137,15 @@ def _compare(
         Their places as shares of the view's width and height [Q, 2], and whether they agree, bool [Q].
     """
     depth, places = _project(points, viewmat, depths)
-    in_image = (places >= 0) & (places < 1)
+    in_image = places >= 0
+    in_image &= places < 1
     inside = (depth > 0) & in_image.all(dim=1)
     known = _read(depths.depth[..., None], places)[:, 0]
     confidence = _read(depths.confidence[..., None], places)[:, 0]
-    agrees = inside & (confidence >= AGREEING_CONFIDENCE)
-    agrees &= (known - depth).abs() < DEPTH_TOLERANCE * depth
+    difference = known - depth
+    is_confident = confidence >= AGREEING_CONFIDENCE
+    is_as_deep = difference.abs() < DEPTH_TOLERANCE * depth
+    agrees = inside & is_confident & is_as_deep
     return places, agrees
 
 

@@ -59,11 +59,14 @@ def neighbour_scales(
     """
     if len(points) == 0:
         raise ValueError("There are no points to start from: give SfM points, or set pipeline.model.random-init True.")
-    diagonal = points.amax(0) - points.amin(0)
+    low = points.amin(0)
+    high = points.amax(0)
+    diagonal = high - low
     extent = float(diagonal.norm())
     if extent == 0:
         extent = 1.0
-    num_neighbours = min(3, len(points) - 1)
+    num_others = len(points) - 1
+    num_neighbours = min(3, num_others)
     if num_neighbours < 1:
         return torch.full_like(points[:, 0], 0.01 * extent)
     array = points.detach().cpu().numpy()

@@ -55,11 +55,13 @@ def _nearest_depth(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) 
     """Least depth of the views' `NEAREST_POINTS`-th nearest points, infinite if no view sees so many."""
     step = math.ceil(len(points) / _MOST_POINTS)
     points = points[::step]
-    views_at_once = max(_PAIRS // len(points), 1)
+    views_at_once = _PAIRS // len(points)
+    views_at_once = max(views_at_once, 1)
     cameras = (tensor.split(views_at_once) for tensor in (viewmats, Ks, sizes))
     nearest = math.inf
     for part in zip(*cameras, strict=True):
         depths = depths_in_views(points, *part)  # [c, P]
         trusted = depths.kthvalue(NEAREST_POINTS, dim=1).values  # [c]
-        nearest = min(nearest, float(trusted.min()))
+        of_part = float(trusted.min())
+        nearest = min(nearest, of_part)
     return nearest

@@ -30,7 +30,8 @@ def far_outliers(
     with np.errstate(over="ignore"):  # Squares of numbers that are nearly infinite overflow.
         from_median = sound - np.median(sound, axis=0)
         distances = np.linalg.norm(from_median, axis=-1)
-    rank = int(share * (len(sound) - 1))
+    last = len(sound) - 1
+    rank = int(share * last)
     usual = np.partition(distances, rank)[rank]
     if usual > 0:
         outliers[~outliers] = distances > REACH * usual

@@ -33,8 +33,10 @@ def limit_scales(
     """
     reach = scales.amax(dim=1).exp() / angular_scale  # No camera farther away than this limits a Gaussian. [N]
     distances = camera_distances(means, positions, reach)
-    limits = (angular_scale * distances).clamp_min(_LEAST_LIMIT).log()  # [N]
-    limited = torch.minimum(scales, limits[:, None])
+    limits = angular_scale * distances  # [N]
+    limits = limits.clamp_min(_LEAST_LIMIT)
+    log_limits = limits.log()
+    limited = torch.minimum(scales, log_limits[:, None])
     scales.copy_(limited)
 
 
@@ -66,7 +68,8 @@ def _distances(means: Tensor, low: Tensor, high: Tensor | None = None) -> Tensor
 
     One axis is added at a time: matrix products cancel far from the origin, and without them `torch.cdist` is slow.
     """
-    points_at_once = max(_PAIRS // len(low), 1)
+    points_at_once = _PAIRS // len(low)
+    points_at_once = max(points_at_once, 1)
     nearest = []
     for part in means.split(points_at_once):
         squares = part.new_zeros(())

@@ -168,7 +168,9 @@ def _working_size(size: Sequence[int]) -> list[int]:
     The coarsest level's stride divides them, so that a level's pixels are exact quarters of the next one's.
     """
     stride = 2 ** (LEVELS - 1)
-    factor = min(1.0, WORKING_SIDE / max(size)) / stride
+    reduction = WORKING_SIDE / max(size)
+    reduction = min(1.0, reduction)
+    factor = reduction / stride  # Sides of the coarsest level, relative to the image's
     return [stride * max(round(side * factor), 1) for side in size]
 
 
@@ -178,8 +180,10 @@ def _mean(
     """Mean of valid grey values, from weighted sums of `_View.levels`; half of the weight is enough. [1, 2, h, w]"""
     grey = sums[:, :1]
     weight = sums[:, 1:]
-    valid = (weight >= 0.5).to(sums)
-    mean = grey / weight.clamp_min(0.5) * valid
+    is_valid = weight >= 0.5
+    valid = is_valid.to(sums)
+    divisor = weight.clamp_min(0.5)
+    mean = grey / divisor * valid
     return torch.cat([mean, valid], dim=1)
 
 
@@ -241,7 +245,8 @@ def _solve(view: _View, views: list[_View]) -> tuple[Tensor, Tensor]:
     smallest, largest = view.inverse
     # A step moves a pixel of the coarsest level by about 1 px.
     wanted = math.ceil((largest - smallest) / (view.step * 2 ** (LEVELS - 1)))
-    count = min(max(wanted, 8), HYPOTHESES)
+    count = max(wanted, 8)
+    count = min(count, HYPOTHESES)
     step = (largest - smallest) / count
     numbers = torch.arange(count + 1, device=device)[:, None, None]  # [D, 1, 1]
     peak, score = _peak(_scores(view, views, LEVELS - 1, smallest + step * numbers))
@@ -252,8 +257,11 @@ def _solve(view: _View, views: list[_View]) -> tuple[Tensor, Tensor]:
         inverse = enlarged[0, 0]
         step /= 2  # Pixels are half as large, and the five hypotheses reach as far as the last step.
         peak, score = _peak(_scores(view, views, level, inverse + step * around))
-        inverse = inverse + step * (peak - 2)
-    known = (score > SCORES[0]) & (inverse > 0) & (finest_valid > 0)
+        correction = step * (peak - 2)
+        inverse = inverse + correction
+    known = score > SCORES[0]
+    known &= inverse > 0
+    known &= finest_valid > 0
     return torch.where(known, inverse, 0.0), score
 
 
@@ -347,8 +355,10 @@ def _peak(
     before = scores.gather(0, (index - 1).clamp_min(0))
     after = scores.gather(0, (index + 1).clamp_max(last))
     curvature = (2 * score - before - after).clamp_min(_TINY)
-    offset = 0.5 * (after - before) / curvature
-    is_inside = (index > 0) & (index < last)
+    slope = 0.5 * (after - before)
+    offset = slope / curvature
+    is_inside = index > 0
+    is_inside &= index < last
     offset = torch.where(is_inside, offset, 0.0)
     return (index + offset)[0], score[0]
 
@@ -366,15 +376,19 @@ def _confidence(
     agreeing = torch.zeros_like(inverse)
     for to, back, other in zip(view.to, view.back, others, strict=True):
         agreeing += _agrees(inverse, other, to, back)
-    most = min(len(others), AGREEING)
+    num_neighbours = len(others)
+    most = min(num_neighbours, AGREEING)
     needed = 1
     if most > 2:
         needed = 2
-    enough = (agreeing >= needed) & (inverse > 0)
+    enough = agreeing >= needed
+    enough &= inverse > 0
     low, high = SCORES
     by_score = ((score - low) / (high - low)).clamp(0, 1)
-    by_neighbours = (agreeing / max(most, 1)).clamp_max(1)
-    return torch.where(enough, by_score * by_neighbours, 0.0)
+    by_neighbours = agreeing / max(most, 1)
+    by_neighbours = by_neighbours.clamp_max(1)
+    confidence = by_score * by_neighbours
+    return torch.where(enough, confidence, 0.0)
 
 
 def _agrees(

@@ -49,7 +49,8 @@ def choose_neighbours(
         chosen[:, i] = torch.where(value > 0, best, -1)
         direction = directions.gather(1, best[:, None, None].expand(-1, 1, 3))  # [V, 1, 3]
         similarity = (directions * direction).sum(dim=2).clamp_min(0)  # [V, V]
-        weight = weight * (1 - 0.5 * similarity)
+        factor = 1 - 0.5 * similarity
+        weight = weight * factor
         weight.scatter_(1, best[:, None], 0)
     return chosen
 
@@ -71,8 +72,10 @@ def _pair_weights(
     for part in views.split(views_at_once):
         cosines = (rays[part, None] * rays).sum(dim=3).clamp(-1, 1)  # [v, V, P]
         angles = cosines.acos().rad2deg()
-        gain = (angles / smallest).clamp_max(1)
-        gain *= ((_WIDEST_ANGLE - angles) / (_WIDEST_ANGLE - widest)).clamp(0, 1)
+        gain = angles / smallest
+        gain = gain.clamp_max(1)
+        fall = (_WIDEST_ANGLE - angles) / (_WIDEST_ANGLE - widest)
+        gain *= fall.clamp(0, 1)
         ratios = scales[part, None] / scales
         likeness = torch.minimum(ratios, 1 / ratios)
         both_see = seen[part, None] & seen

@@ -21,9 +21,15 @@ def depths_in_views(
     sizes = sizes.to(points)
     rotations = viewmats[:, :3, :3]
     translations = viewmats[:, :3, 3:]
-    projected = (Ks @ rotations) @ points.T + Ks @ translations  # [C, 3, P]
+    to_pixels = Ks @ rotations
+    shifts = Ks @ translations
+    projected = to_pixels @ points.T + shifts  # [C, 3, P]
     x, y, depths = projected.unbind(dim=1)  # x and y are px times depth.
-    inside_x = (x >= 0) & (x <= sizes[:, :1] * depths)
-    inside_y = (y >= 0) & (y <= sizes[:, 1:] * depths)
-    inside = inside_x & inside_y & (depths > 0)
+    widths = sizes[:, :1]
+    heights = sizes[:, 1:]
+    inside = depths > 0
+    inside &= x >= 0
+    inside &= x <= widths * depths
+    inside &= y >= 0
+    inside &= y <= heights * depths
     return torch.where(inside, depths, torch.inf)
