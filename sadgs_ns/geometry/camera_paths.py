@@ -10,21 +10,32 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-REACH = 1.5  # Reach of the empty space around a path, in near planes; 1 left some of room, and 2 cost a view 2.6 dB
-HAZE_LENGTH = 0.1  # Haze is longer, in standard deviations, than this share of its distance from a path; .2 left some
-SUPPORT = 0.4  # And no point to start from lies within this share of it: needles among leaves reach points twice as far
-TOO_WIDE = 0.4  # Or its second axis is longer than this share: nobody stands so near a surface with a camera
-NEIGHBOURS = 4  # Each camera has paths to this many others: the nearest ones that look in a similar direction
-SIMILAR_DEGREES = 60.0  # Largest angle between the viewing axes of two cameras with a path between them
-SAME_PLACE = 5e-4  # Share of the reach within which cameras stand in one place, such as the parts of a panorama
-LONGEST = 20.0  # Longest path, in near planes or in medians of the distance from a camera to its nearest neighbour
-_CUBES = 2**12  # Cubes along each side of a grid, at most; float32 tells them apart
-_PAIRS = 2**21  # Pairs of a point and a path that are computed at a time, in arrays of 25 MB
+REACH = 1.5
+"""Reach of the empty space around a path, in near planes. 1 left some of room, and 2 cost a view 2.6 dB."""
+HAZE_LENGTH = 0.1
+"""Haze is longer, in standard deviations, than this share of its distance from a path. .2 left some."""
+SUPPORT = 0.4
+"""No point to start from lies within this share of the distance: needles among leaves reach points twice as far."""
+TOO_WIDE = 0.4
+"""Or its second axis is longer than this share: nobody stands so near a surface with a camera."""
+NEIGHBOURS = 4
+"""Each camera has paths to this many others: the nearest ones that look in a similar direction."""
+SIMILAR_DEGREES = 60.0
+"""Largest angle between the viewing axes of two cameras with a path between them."""
+SAME_PLACE = 5e-4
+"""Share of the reach within which cameras stand in one place, such as the parts of a panorama."""
+LONGEST = 20.0
+"""Longest path, in near planes or in medians of the distance from a camera to its nearest neighbour."""
+_CUBES = 2**12
+"""Cubes along each side of a grid, at most; float32 tells them apart."""
+_PAIRS = 2**21
+"""Pairs of a point and a path that are computed at a time, in arrays of 25 MB."""
 
 
 @dataclass(frozen=True)
@@ -44,80 +55,159 @@ class CameraPaths:
     ) -> CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         rotations = viewmats[:, :3, :3].double().cpu()
-        centres = -(rotations.mT @ viewmats[:, :3, 3:].double().cpu())[..., 0]  # [C, 3]
+        translations = viewmats[:, :3, 3:].double().cpu()
+        centres = -(rotations.mT @ translations)[..., 0]  # [C, 3]
+        viewing_axes = rotations[:, 2]  # [C, 3]
         reach = REACH * near_plane
-        distances = torch.cdist(centres, centres)
-        unlike = rotations[:, 2] @ rotations[:, 2].T < math.cos(math.radians(SIMILAR_DEGREES))
-        nearest = distances.masked_fill_(unlike | (distances < SAME_PLACE * reach), torch.inf).fill_diagonal_(torch.inf)
-        nearest = nearest.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
-        longest = LONGEST * max(near_plane, float(nearest.values[:, :1].median()))
-        first = torch.arange(len(centres))[:, None].expand_as(nearest.indices)
-        pairs = torch.stack([first, nearest.indices], dim=-1)[nearest.values < longest].sort(dim=1).values
-        pairs = torch.cat([torch.arange(len(centres))[:, None].expand(-1, 2), pairs.unique(dim=0)])  # [E, 2]
+        pairs = _connect_neighbours(centres, viewing_axes, near_plane, SAME_PLACE * reach)  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
         # `haze` looks at no point farther away.
-        return CameraPaths(starts, ends, reach, points[_near(points, starts, ends, (1 + SUPPORT) * reach)[0] > 0])
+        nearby = _find_paths(points, starts, ends, (1 + SUPPORT) * reach)
+        return CameraPaths(starts, ends, reach, points[nearby.counts > 0])
 
     @cached_property
     def surfaces(self) -> KDTree:
         """A search tree of the points. Comparing all pairs took 40 % of castle's loop on a GPU."""
-        return KDTree(self.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)  # is built soonest
+        # A tree with these options is built soonest.
+        return KDTree(self.points.cpu().numpy(), balanced_tree=False, compact_nodes=False)
 
     @torch.no_grad()
     def haze(
         self,
         means: Tensor,  # [N, 3]
-        scales: Tensor,  # [N, 3]
+        scales: Tensor,  # [N, 3] standard deviations in world units
     ) -> Tensor:
         """Tell which Gaussians are haze near a path; one whose centre is not finite is not. bool [N]"""
-        from_path = torch.full_like(means[:, 0], torch.inf)  # [N]
-        counts, firsts, listed = _near(means, self.starts, self.ends, self.reach)
-        most = int(counts.max()) if len(counts) else 0
-        for part in counts.nonzero()[:, 0].split(_PAIRS // max(most, 1) + 1):
-            which = part.repeat_interleave(counts[part])  # A Gaussian for each of K pairs. [K]
-            before = (counts[part].cumsum(dim=0) - counts[part]).repeat_interleave(counts[part])  # [K]
-            paths = listed[firsts[which] + torch.arange(len(which), device=which.device) - before]
-            distances = _distances(means[which], self.starts[paths], self.ends[paths])
-            from_path.scatter_reduce_(0, which, distances, "amin")
-        haze = (from_path < self.reach) & (scales.amax(dim=1) > HAZE_LENGTH * from_path)
+        from_path = self._distances_from_paths(means)
+        is_near = from_path < self.reach
+        longest_axes = scales.amax(1)
+        is_long = longest_axes > HAZE_LENGTH * from_path
+        haze = is_near & is_long
         found = haze.nonzero()[:, 0]
-        ways, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
-        alone = torch.from_numpy(ways).to(means) > SUPPORT * from_path[found]
-        haze[found] = alone | (scales[found].median(dim=1).values > TOO_WIDE * from_path[found])
+        from_path = from_path[found]
+        from_surface, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
+        from_surface = torch.from_numpy(from_surface).to(means)
+        is_alone = from_surface > SUPPORT * from_path
+        second_axes = scales[found].median(dim=1).values
+        is_wide = second_axes > TOO_WIDE * from_path
+        haze[found] = is_alone | is_wide
         return haze
 
+    def _distances_from_paths(self, means: Tensor) -> Tensor:
+        """Distances of positions [N, 3] from the nearest path; more than the reach, or infinite, far from all. [N]"""
+        from_path = torch.full_like(means[:, 0], torch.inf)
+        nearby = _find_paths(means, self.starts, self.ends, self.reach)
+        counts = nearby.counts
+        candidates = counts.nonzero()[:, 0]
+        most = 1
+        if len(candidates) > 0:
+            most = int(counts.max())
+        for part in candidates.split(_PAIRS // most + 1):
+            # K pairs of a position and each of its paths.
+            which = part.repeat_interleave(counts[part])  # [K]
+            pairs_before = counts[part].cumsum(dim=0) - counts[part]
+            pairs_before = pairs_before.repeat_interleave(counts[part])  # [K]
+            pairs = torch.arange(len(which), device=which.device)
+            number = pairs - pairs_before  # 0 for the first path of a position, and so on
+            paths = nearby.paths[nearby.firsts[which] + number]
+            distances = _distances(means[which], self.starts[paths], self.ends[paths])
+            from_path.scatter_reduce_(0, which, distances, "amin")
+        return from_path
 
-def _near(positions: Tensor, starts: Tensor, ends: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
-    """List the paths [E, 3] that may come within `reach` of positions [N, 3]; a position that is NaN has none.
 
-    A cube around all paths is halved again and again, without the parts that no path comes so near to. Return how many
-    paths each position has [N], the first of them in the list [N], and the list of paths [K]; int64.
+def _connect_neighbours(
+    centres: Tensor,  # float64 [C, 3]
+    viewing_axes: Tensor,  # float64 [C, 3]
+    near_plane: float,
+    same_place: float,  # distance in world units under which two cameras stand in one place
+) -> Tensor:
+    """Connect each camera with itself, and with its nearest neighbours that look in a similar direction.
+
+    Returns:
+        Pairs of cameras, none twice. int64 [E, 2]
     """
-    corner = starts.amin(dim=0) - reach
-    side = float((starts.amax(dim=0) + reach - corner).max())
-    smallest = max(reach, side / _CUBES)
+    distances = torch.cdist(centres, centres)  # [C, C]
+    is_unlike = viewing_axes @ viewing_axes.T < math.cos(math.radians(SIMILAR_DEGREES))
+    is_same_place = distances < same_place
+    distances.masked_fill_(is_unlike | is_same_place, torch.inf)
+    distances.fill_diagonal_(torch.inf)
+    nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
+    usual = float(nearest.values[:, :1].median())  # NaN for a single camera
+    unit = max(near_plane, usual)
+    longest = LONGEST * unit
+    cameras = torch.arange(len(centres))[:, None]
+    pairs = torch.stack([cameras.expand_as(nearest.indices), nearest.indices], dim=-1)
+    pairs = pairs[nearest.values < longest]
+    pairs = pairs.sort(dim=1).values.unique(dim=0)
+    return torch.cat([cameras.expand(-1, 2), pairs])
+
+
+class _NearbyPaths(NamedTuple):
+    """The paths that may come near N positions."""
+
+    counts: Tensor  # Number of paths of each position. int64 [N]
+    firsts: Tensor  # Where its paths begin in `paths`. int64 [N]
+    paths: Tensor  # Indices of paths, those of a position in a row. int64 [K]
+
+
+def _find_paths(
+    positions: Tensor,  # [N, 3]
+    starts: Tensor,  # [E, 3]
+    ends: Tensor,  # [E, 3]
+    reach: float,
+) -> _NearbyPaths:
+    """List the paths that may come within `reach` of positions; a position that is NaN has none.
+
+    A cube around all paths is halved again and again, without the parts that no path comes so near to.
+    """
+    lowest = starts.amin(0)
+    highest = starts.amax(0)
+    corner = lowest - reach
+    extents = highest + reach - corner
+    side = float(extents.max())
+    finest = side / _CUBES
+    smallest = max(reach, finest)
     halves = torch.tensor([-0.5, 0.5], device=starts.device)
-    middles = (corner + side / 2).expand_as(starts)
+    octants = torch.cartesian_prod(halves, halves, halves)  # [8, 3]
+    # Pairs of a cube, by its middle, and a path.
+    middle = corner + side / 2
+    middles = middle.expand_as(starts)
     paths = torch.arange(len(starts), device=starts.device)
     while side > smallest and len(paths) <= _PAIRS // 4:
         side /= 2
-        middles = (middles[:, None] + side * torch.cartesian_prod(halves, halves, halves)).view(-1, 3)
+        middles = (middles[:, None] + side * octants).view(-1, 3)
         paths = paths.repeat_interleave(8)
-        near = _distances(middles, starts[paths], ends[paths]) <= reach + side  # But for rounding, √3/2 of it would do.
-        middles = middles[near]
-        paths = paths[near]
-    cubes = ((torch.cat([middles, positions]) - corner) / side).nan_to_num(-1.0).clamp(-1, _CUBES).floor().long()
-    cubes = (cubes[:, 0] * (_CUBES + 2) + cubes[:, 1]) * (_CUBES + 2) + cubes[:, 2]
-    (listed, order) = cubes[: len(paths)].sort()
-    places = cubes[len(paths) :]
+        distances = _distances(middles, starts[paths], ends[paths])
+        is_near = distances <= reach + side  # But for rounding, √3/2 of the side would do.
+        middles = middles[is_near]
+        paths = paths[is_near]
+    listed, order = _cube_numbers(middles, corner, side).sort()
+    places = _cube_numbers(positions, corner, side)
     firsts = torch.searchsorted(listed, places)
-    return torch.searchsorted(listed, places, right=True) - firsts, firsts, paths[order]
+    ends_of_lists = torch.searchsorted(listed, places, right=True)
+    counts = ends_of_lists - firsts
+    return _NearbyPaths(counts, firsts, paths[order])
 
 
-def _distances(positions: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """Distances of positions from straight paths, all [K, 3]. [K]"""
+def _cube_numbers(positions: Tensor, corner: Tensor, side: float) -> Tensor:
+    """Number the cubes of a grid from `corner` [3] in which positions [N, 3] lie, alike outside the grid. int64 [N]"""
+    from_corner = positions - corner
+    places = from_corner / side
+    places = places.nan_to_num(-1.0)
+    x, y, z = places.clamp(-1, _CUBES).floor().long().unbind(dim=1)
+    return (x * (_CUBES + 2) + y) * (_CUBES + 2) + z
+
+
+def _distances(
+    positions: Tensor,  # [K, 3]
+    starts: Tensor,  # [K, 3]
+    ends: Tensor,  # [K, 3]
+) -> Tensor:
+    """Distance of each position from its straight path. [K]"""
     ways = ends - starts
     away = positions - starts
     squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
-    along = ((away * ways).sum(dim=1) / squares).clamp(0, 1)
+    products = (away * ways).sum(dim=1)
+    along = products / squares
+    along = along.clamp(0, 1)  # Nearest place of the path: 0 is its start, and 1 its end.
     return torch.addcmul(away, along[:, None], ways, value=-1).norm(dim=1)

@@ -117,7 +117,8 @@ def choose_remaining(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Vis
     goes: dict[str, Tensor] = {}  # What each option would take of all Gaussians, in the order of the options
     if cleaning.crop is not None:
         low, high = means.new_tensor(cleaning.crop).view(2, 3)
-        is_inside = (means >= low) & (means <= high)  # [N, 3]
+        is_inside = means >= low  # [N, 3]
+        is_inside &= means <= high
         goes["crop"] = ~is_inside.all(dim=1)
     if cleaning.max_extent is not None:
         goes["max_extent"] = extents > cleaning.max_extent

@@ -15,13 +15,20 @@ from torch import Tensor
 
 from sadgs_ns.geometry.stereo import DepthMap
 
-NUMBER = 150_000  # Most points that are drawn
-MIN_CONFIDENCE = 0.5  # Confidence of a depth from which its pixel is drawn
-AGREEING_CONFIDENCE = 0.1  # Confidence from which a depth counts when views are asked whether they agree
-AGREEING_VIEWS = 2  # Views, its own among them, that must agree with a point's depth
-DEPTH_TOLERANCE = 0.02  # Largest relative difference of depths that agree
-SCALE = 0.5  # Largest standard deviation of a point, in wavelengths: its η is 1/2
-_DRAWN = 4  # Points that are drawn for each one that is wanted, because many do not stay
+NUMBER = 150_000
+"""Most points that are drawn."""
+MIN_CONFIDENCE = 0.5
+"""Confidence of a depth from which its pixel is drawn."""
+AGREEING_CONFIDENCE = 0.1
+"""Confidence from which a depth counts when views are asked whether they agree."""
+AGREEING_VIEWS = 2
+"""Views, its own among them, that must agree with a point's depth."""
+DEPTH_TOLERANCE = 0.02
+"""Largest relative difference of depths that agree."""
+SCALE = 0.5
+"""Largest standard deviation of a point, in wavelengths: its η is 1/2."""
+_DRAWN = 4
+"""Points that are drawn for each one that is wanted, because many do not stay."""
 
 
 class DensePoints(NamedTuple):
@@ -50,63 +57,118 @@ def dense_points(
         viewmats: World to camera. [V, 4, 4]
         image: Returns the image of a view in [0, 1], of any size. [H, W, 3]
         wavelength: Returns Λ of a view's image in px of that image; NaN where it is unknown. [H, W]
+        number: Most points, > 0.
+        seed: Of the random numbers.
     """
     device = maps[0].depth.device
     viewmats = viewmats.to(device)
     generator = torch.Generator(device).manual_seed(seed)
     views = list(zip(maps, viewmats, strict=True))
-    candidates = [_candidates(*view, wavelength(i)) for i, view in enumerate(views)]
+    candidates = [_candidates(depths, viewmat, wavelength(i)) for i, (depths, viewmat) in enumerate(views)]
     means, weights, scales = (torch.cat(values) for values in zip(*candidates, strict=True))
-    # The largest of log weight plus Gumbel noise are a draw without replacement.
-    noise = torch.rand(len(means), generator=generator, device=device).clamp(1e-12, 1 - 1e-7)
-    keys = weights.log() - (-noise.log()).log()
-    drawn = keys.topk(min(len(means), _DRAWN * number)).indices
+    drawn = _draw(weights, min(len(means), _DRAWN * number), generator)
     means = means[drawn]
     scales = scales[drawn]
-    agreeing = torch.zeros(len(means), device=device)
-    colors = torch.zeros_like(means)
-    for i, (m, viewmat) in enumerate(views):
-        depths, places = _places(means, viewmat, m)  # [Q], [Q, 2]
-        inside = (depths > 0) & ((places >= 0) & (places < 1)).all(dim=1)
-        known = _read(m.depth[..., None], places)[:, 0]
-        agrees = inside & (_read(m.confidence[..., None], places)[:, 0] >= AGREEING_CONFIDENCE)
-        agrees &= (known - depths).abs() < DEPTH_TOLERANCE * depths
+    agreeing = torch.zeros(len(means), device=device)  # Number of views that agree with each point. [Q]
+    colors = torch.zeros_like(means)  # Sum of these views' colours. [Q, 3]
+    for i, (depths, viewmat) in enumerate(views):
+        places, agrees = _compare(means, viewmat, depths)
         colors += torch.where(agrees[:, None], _read(image(i), places), 0.0)
         agreeing += agrees
     chance = torch.rand(len(means), generator=generator, device=device)
-    stays = (agreeing >= AGREEING_VIEWS) & (chance < AGREEING_VIEWS / agreeing.clamp_min(1))
+    enough = agreeing >= AGREEING_VIEWS
+    # Every view that agrees draws points of the same surface.
+    share = AGREEING_VIEWS / agreeing.clamp_min(1)
+    stays = enough & (chance < share)
     chosen = stays.nonzero()[:, 0]
-    chosen = chosen[torch.randperm(len(chosen), generator=generator, device=device)[:number]]
-    return DensePoints(means[chosen], colors[chosen] / agreeing[chosen, None], scales[chosen])
+    order = torch.randperm(len(chosen), generator=generator, device=device)
+    chosen = chosen[order[:number]]
+    mean_colors = colors[chosen] / agreeing[chosen, None]
+    return DensePoints(means[chosen], mean_colors, scales[chosen])
 
 
-def _candidates(depths: DepthMap, viewmat: Tensor, wavelength: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _draw(
+    weights: Tensor,  # [Q], > 0
+    number: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Draw without replacement, with these weights: the largest of log weight plus Gumbel noise. int64 [number]"""
+    noise = torch.rand(len(weights), generator=generator, device=weights.device)
+    noise = noise.clamp(1e-12, 1 - 1e-7)
+    keys = weights.log() - (-noise.log()).log()
+    return keys.topk(number).indices
+
+
+def _candidates(
+    depths: DepthMap,
+    viewmat: Tensor,  # [4, 4]
+    wavelength: Tensor,  # in px of the image [H, W]
+) -> tuple[Tensor, Tensor, Tensor]:
     """Points of a view's confident pixels [Q, 3], their weights [Q], and half their wavelengths in world units [Q]."""
-    rows, columns = (depths.confidence >= MIN_CONFIDENCE).nonzero(as_tuple=True)
+    is_confident = depths.confidence >= MIN_CONFIDENCE
+    rows, columns = is_confident.nonzero(as_tuple=True)
     height, width = depths.depth.shape
     pixels = torch.stack([columns, rows], dim=1) + 0.5  # [Q, 2]
-    size = pixels.new_tensor([width, height])
+    places = pixels / pixels.new_tensor([width, height])
+    in_image = _read(wavelength.to(pixels)[..., None], places)[:, 0]
     reduced = width / wavelength.shape[1]
-    local = reduced * _read(wavelength.to(pixels)[..., None], pixels / size)[:, 0]  # Λ in px of the depth map
+    local = reduced * in_image  # Λ in px of the depth map. [Q]
     known = local.isfinite()
     local = local[known].clamp_min(1.0)
     depth = depths.depth[rows, columns][known]
-    rays = (pixels[known] - depths.K[:2, 2]) / depths.K.diagonal()[:2]
+    focal = depths.K.diagonal()[:2]
+    centre = depths.K[:2, 2]
+    from_centre = pixels[known] - centre
+    rays = from_centre / focal
     in_camera = torch.cat([rays * depth[:, None], depth[:, None]], dim=1)
-    return (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3], local**-2, SCALE * local * depth / depths.K[0, 0]
+    means = (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3]
+    scales = SCALE * local * depth / depths.K[0, 0]
+    return means, local**-2, scales
 
 
-def _places(points: Tensor, viewmat: Tensor, depths: DepthMap) -> tuple[Tensor, Tensor]:
+def _compare(
+    points: Tensor,  # [Q, 3]
+    viewmat: Tensor,  # [4, 4]
+    depths: DepthMap,
+) -> tuple[Tensor, Tensor]:
+    """Find where points lie in a view, and whether its depths there agree with theirs.
+
+    Returns:
+        Their places as shares of the view's width and height [Q, 2], and whether they agree, bool [Q].
+    """
+    depth, places = _project(points, viewmat, depths)
+    in_image = places >= 0
+    in_image &= places < 1
+    inside = (depth > 0) & in_image.all(dim=1)
+    known = _read(depths.depth[..., None], places)[:, 0]
+    confidence = _read(depths.confidence[..., None], places)[:, 0]
+    difference = known - depth
+    is_confident = confidence >= AGREEING_CONFIDENCE
+    is_as_deep = difference.abs() < DEPTH_TOLERANCE * depth
+    agrees = inside & is_confident & is_as_deep
+    return places, agrees
+
+
+def _project(points: Tensor, viewmat: Tensor, depths: DepthMap) -> tuple[Tensor, Tensor]:
     """Depths of points [Q, 3] in a view [Q], and their places as shares of its width and height [Q, 2]."""
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = in_camera[:, 2]
-    size = points.new_tensor([depths.depth.shape[1], depths.depth.shape[0]])
-    pixels = in_camera[:, :2] / depth[:, None] * depths.K.diagonal()[:2] + depths.K[:2, 2]
-    return depth, pixels / size
+    height, width = depths.depth.shape
+    focal = depths.K.diagonal()[:2]
+    centre = depths.K[:2, 2]
+    pixels = in_camera[:, :2] / depth[:, None] * focal + centre
+    return depth, pixels / points.new_tensor([width, height])
 
 
-def _read(values: Tensor, places: Tensor) -> Tensor:
-    """The values [H, W, D] of the pixels at places given as shares of width and height [Q, 2]. [Q, D]"""
+def _read(
+    values: Tensor,  # [H, W, D]
+    places: Tensor,  # shares of width and height [Q, 2]
+) -> Tensor:
+    """Return the values of the pixels at these places, or of the nearest ones at the border. [Q, D]"""
     height, width = values.shape[:2]
-    columns, rows = (places * places.new_tensor([width, height])).nan_to_num(0.0).clamp(-1, 1e6).long().unbind(1)
-    return values[rows.clamp(0, height - 1), columns.clamp(0, width - 1)]
+    pixels = places * places.new_tensor([width, height])
+    pixels = pixels.nan_to_num(0.0).clamp(-1, 1e6).long()
+    columns, rows = pixels.unbind(1)
+    rows = rows.clamp(0, height - 1)
+    columns = columns.clamp(0, width - 1)
+    return values[rows, columns]

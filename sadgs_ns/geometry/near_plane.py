@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 
-from sadgs_ns.geometry.initialization import plausible_points
+from sadgs_ns.geometry.extents import plausible_points
+from sadgs_ns.geometry.view_depths import depths_in_views
 
-NEAREST_POINTS = 5  # A view's fifth nearest SfM point is trusted; the four that are nearer may be errors
+NEAREST_POINTS = 5
+"""A view's fifth nearest SfM point is trusted; the four that are nearer may be errors."""
 NEAR_SHARE = 0.5
 """The near plane, as a share of the smallest such depth of all views. At 0.25 haze was left in two of nine sets of
 held-out views, and at 1 a view of leaves lost 9 dB (docs/results.md#near-plane)."""
-UNKNOWN_SHARE = 0.01  # The near plane where no view sees enough SfM points, as a share of the cameras' extent
-_MOST_POINTS = 2**17  # At most this many points are looked at, because each is projected into every view
-_PAIRS = 2**24  # Pairs of a pose and a point that are computed at a time, in arrays of 64 MB
+UNKNOWN_SHARE = 0.01
+"""The near plane where no view sees enough SfM points, as a share of the cameras' extent."""
+_MOST_POINTS = 2**17
+"""At most this many points are looked at, because each is projected into every view."""
+_PAIRS = 2**24
+"""Pairs of a pose and a point that are computed at a time, in arrays of 64 MB."""
 
 
 def scene_near_plane(
@@ -29,29 +33,35 @@ def scene_near_plane(
     sizes: Tensor,  # [C, 2]
     extent: float,
 ) -> float:
-    """Derive the near plane of a scene, > 0, given arguments of `depths_in_views` and `initialization.camera_extent`.
+    """Derive the near plane of a scene in world units, > 0.
 
     The training camera whose `NEAREST_POINTS`-th nearest SfM point has the least depth decides.
+
+    Args:
+        points: The scene's SfM points. [P, 3]
+        viewmats, Ks, sizes: The training cameras, as `depths_in_views` takes them.
+        extent: The cameras' extent (`extents.camera_extent`).
     """
     points = points[plausible_points(points)]
     nearest = math.inf
     if len(points) >= NEAREST_POINTS:
-        points = points[:: -(-len(points) // _MOST_POINTS)]  # [P, 3]
-        cameras = (tensor.split(max(_PAIRS // len(points), 1)) for tensor in (viewmats, Ks, sizes))
-        depths = (depths_in_views(points, *some) for some in zip(*cameras, strict=True))  # each [c, P]
-        nearest = min(float(some.kthvalue(NEAREST_POINTS, dim=1).values.min()) for some in depths)
-    return NEAR_SHARE * nearest if nearest < math.inf else UNKNOWN_SHARE * extent
+        nearest = _nearest_depth(points, viewmats, Ks, sizes)
+    if nearest < math.inf:
+        return NEAR_SHARE * nearest
+    return UNKNOWN_SHARE * extent
 
 
-def depths_in_views(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
-    """Depths of points [P, 3] along the viewing axes of cameras (`render.types.Cameras`), infinite outside the image.
-
-    `sizes` are the images' widths and heights in px [C, 2]. [C, P]
-    """
-    viewmats = viewmats.to(points)
-    Ks = Ks.to(points)
-    sizes = sizes.to(points)
-    projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
-    x, y, depths = projected.unbind(dim=1)
-    inside = (x >= 0) & (x <= sizes[:, :1] * depths) & (y >= 0) & (y <= sizes[:, 1:] * depths) & (depths > 0)
-    return torch.where(inside, depths, torch.inf)
+def _nearest_depth(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> float:
+    """Least depth of the views' `NEAREST_POINTS`-th nearest points, infinite if no view sees so many."""
+    step = math.ceil(len(points) / _MOST_POINTS)
+    points = points[::step]
+    views_at_once = _PAIRS // len(points)
+    views_at_once = max(views_at_once, 1)
+    cameras = (tensor.split(views_at_once) for tensor in (viewmats, Ks, sizes))
+    nearest = math.inf
+    for part in zip(*cameras, strict=True):
+        depths = depths_in_views(points, *part)  # [c, P]
+        trusted = depths.kthvalue(NEAREST_POINTS, dim=1).values  # [c]
+        of_part = float(trusted.min())
+        nearest = min(nearest, of_part)
+    return nearest

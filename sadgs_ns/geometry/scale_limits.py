@@ -9,10 +9,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-MANY_CAMERAS = 1024  # From this many on, groups of cameras that are far from a Gaussian are ruled out first
-_GROUP = 64  # Cameras of a group; those that follow each other in the order of names are mostly neighbours
-_PAIRS = 2**22  # Distances from Gaussians to cameras that are computed at a time, in three arrays of 16 MB
-_LEAST_LIMIT = 1e-7  # World units. A Gaussian around a camera's centre keeps this size, so that its logarithm is finite
+MANY_CAMERAS = 1024
+"""From this many on, groups of cameras that are far from a Gaussian are ruled out first."""
+_GROUP = 64
+"""Cameras of a group; those that follow each other in the order of names are mostly neighbours."""
+_PAIRS = 2**22
+"""Distances from Gaussians to cameras that are computed at a time, in three arrays of 16 MB."""
+_LEAST_LIMIT = 1e-7
+"""A Gaussian around a camera's centre keeps this size in world units, so that its logarithm is finite."""
 
 
 @torch.no_grad()
@@ -27,9 +31,13 @@ def limit_scales(
     `scales` are the parameters, logarithms of the standard deviations, and `angular_scale` > 0 is the largest standard
     deviation as a share of that distance. The host does not wait for the device, unless there are many cameras.
     """
-    reach = scales.amax(dim=1).exp() / angular_scale
-    limits = (angular_scale * camera_distances(means, positions, reach)).clamp_min(_LEAST_LIMIT).log()  # [N]
-    scales.copy_(torch.minimum(scales, limits[:, None]))
+    reach = scales.amax(dim=1).exp() / angular_scale  # No camera farther away than this limits a Gaussian. [N]
+    distances = camera_distances(means, positions, reach)
+    limits = angular_scale * distances  # [N]
+    limits = limits.clamp_min(_LEAST_LIMIT)
+    log_limits = limits.log()
+    limited = torch.minimum(scales, log_limits[:, None])
+    scales.copy_(limited)
 
 
 def camera_distances(
@@ -43,10 +51,14 @@ def camera_distances(
     """
     if len(positions) < MANY_CAMERAS:
         return _distances(means, positions)
-    in_groups = torch.arange(0, len(positions), _GROUP)[:, None] + torch.arange(_GROUP)  # [C / _GROUP, _GROUP]
-    groups = positions[in_groups.clamp_max(len(positions) - 1).to(positions.device)]
+    firsts = torch.arange(0, len(positions), _GROUP)
+    in_groups = firsts[:, None] + torch.arange(_GROUP)  # [C / _GROUP, _GROUP]
+    in_groups = in_groups.clamp_max(len(positions) - 1)
+    groups = positions[in_groups.to(positions.device)]
+    from_boxes = _distances(means, groups.amin(dim=1), groups.amax(dim=1))
+    is_near = from_boxes < 1.001 * reach
+    near = is_near.nonzero()[:, 0]
     distances = torch.full_like(reach, torch.inf)
-    near = (_distances(means, groups.amin(dim=1), groups.amax(dim=1)) < 1.001 * reach).nonzero()[:, 0]
     distances[near] = _distances(means[near], positions)
     return distances
 
@@ -56,11 +68,16 @@ def _distances(means: Tensor, low: Tensor, high: Tensor | None = None) -> Tensor
 
     One axis is added at a time: matrix products cancel far from the origin, and without them `torch.cdist` is slow.
     """
+    points_at_once = _PAIRS // len(low)
+    points_at_once = max(points_at_once, 1)
     nearest = []
-    for part in means.split(max(_PAIRS // len(low), 1)):
+    for part in means.split(points_at_once):
         squares = part.new_zeros(())
         for k, x in enumerate(part.T[..., None]):  # [n, 1]
-            away = x - low[:, k] if high is None else torch.maximum(low[:, k] - x, x - high[:, k]).clamp_min_(0)
+            if high is None:
+                away = x - low[:, k]
+            else:
+                away = torch.maximum(low[:, k] - x, x - high[:, k]).clamp_min_(0)
             squares = away.square_() + squares  # [n, B]
         nearest.append(squares.amin(dim=1).sqrt())
     return torch.cat(nearest)

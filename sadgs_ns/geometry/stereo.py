@@ -18,27 +18,34 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sadgs_ns.geometry.near_plane import depths_in_views
+from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
+from sadgs_ns.geometry.view_depths import depths_in_views
 
-WORKING_SIDE = 800  # Longest side in px at which depth is computed; larger images are reduced: time grows with the area
-LEVELS = 3  # Levels of the image pyramid. Each has half the sides of the one before
-WINDOW = 5  # Side in px, odd, of the windows that are compared
-SMOOTHING = 5  # Side in px, odd, of the box over which scores are averaged; plain pixels follow their neighbours
-HYPOTHESES = 128  # Most intervals of inverse depth on the coarsest level. Time and memory grow with them
-NEIGHBOURS = 4  # Neighbours per view. Time grows with them; with fewer, occlusions leave holes
-NOISE = 0.004  # Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0
-SCORES = (0.5, 0.8)  # Correlations at which confidence begins and is full. Lower ones add few pixels
-AGREEING = 3  # Neighbours that agree with a depth of full confidence, or all if there are fewer
-DEPTH_TOLERANCE = 0.01  # Largest relative difference between two views' depths that agree
+WORKING_SIDE = 800
+"""Longest side in px at which depth is computed; larger images are reduced: time grows with the area."""
+LEVELS = 3
+"""Levels of the image pyramid. Each has half the sides of the one before."""
+WINDOW = 5
+"""Side in px, odd, of the windows that are compared."""
+SMOOTHING = 5
+"""Side in px, odd, of the box over which scores are averaged; plain pixels follow their neighbours."""
+HYPOTHESES = 128
+"""Most intervals of inverse depth on the coarsest level. Time and memory grow with them."""
+NOISE = 0.004
+"""Standard deviation of grey values in [0, 1], a step of 8 bits, below which the correlation fades to 0."""
+SCORES = (0.5, 0.8)
+"""Correlations at which confidence begins and is full. Lower ones add few pixels."""
+AGREEING = 3
+"""Neighbours that agree with a depth of full confidence, or all if there are fewer."""
+DEPTH_TOLERANCE = 0.01
+"""Largest relative difference between two views' depths that agree."""
 PIXEL_TOLERANCE = 1.0
 """Depths agree if a pixel's own takes it to a neighbour, and the neighbour's takes it back to within this many px."""
 
-_POINTS = 2000  # Most SfM points that are used. Neighbours and ranges are sums and quantiles, which need no more
-_TRIPLES = 2**22  # Triples of two views and a point that are computed at a time, in arrays of 32 to 100 MB
-_BEST_ANGLES = (5.0, 15.0)  # Degrees between two cameras' rays, between which depth is accurate and windows look alike
-_WIDEST_ANGLE = 35.0  # Degrees from which on windows look too different to be compared
-_SHARE = 0.02  # A neighbour is usable if its weight is at least this share of the points that the view sees
-_TINY = 1e-6  # Keeps quotients finite. A point behind a camera is projected far outside its picture
+_POINTS = 2000
+"""Most SfM points that are used. Neighbours and ranges are sums and quantiles, which need no more."""
+_TINY = 1e-6
+"""Keeps quotients finite. A point behind a camera is projected far outside its picture."""
 
 
 @dataclass(frozen=True)
@@ -87,172 +94,214 @@ def depth_maps(
     Returns:
         A map for each view, whose longest side is at most WORKING_SIDE px; empty if it has no usable neighbour.
     """
-    count = len(viewmats)
+    num_views = len(viewmats)
     device = torch.device(device)
-    masks = [None] * count if masks is None else masks
+    if masks is None:
+        masks = [None] * num_views
     # In float64, since positions may be far from the origin, and on the host, which needs the numbers.
     viewmats = viewmats.to("cpu", torch.float64)
     Ks = Ks.to("cpu", torch.float64, copy=True)
     pyramids = []
-    sizes = torch.zeros((count, 2), dtype=torch.float64)
-    for v in range(count):
+    sizes = torch.zeros((num_views, 2), dtype=torch.float64)  # Widths and heights at working size
+    for v in range(num_views):
         image = images(v)
-        pyramids.append(_pyramid(image, masks[v], device))
-        sizes[v] = torch.tensor(pyramids[v][0].shape[:0:-1])
-        Ks[v, :2] *= (sizes[v] / torch.tensor([image.shape[1], image.shape[0]]))[:, None]
+        height, width = image.shape[:2]
+        pyramid = _pyramid(image, masks[v], device)
+        pyramids.append(pyramid)
+        sizes[v] = torch.tensor(pyramid[0].shape[:0:-1])
+        reduction = sizes[v] / torch.tensor([width, height])
+        Ks[v, :2] *= reduction[:, None]
     views = _views(pyramids, viewmats, Ks, sizes, points.to(device))
-    placed = Ks.to(device, torch.float32)
     solved = [_solve(view, views) for view in views]
     maps = []
-    for view, K, (inverse, score) in zip(views, placed, solved, strict=True):
-        confidence = _confidence(view, inverse, score, [solved[n][0] for n in view.neighbours])
-        maps.append(DepthMap(torch.where(confidence > 0, 1 / inverse, 0.0), confidence, K))
+    for view, K, (inverse, score) in zip(views, Ks.to(device, torch.float32), solved, strict=True):
+        of_neighbours = [solved[n][0] for n in view.neighbours]
+        confidence = _confidence(view, inverse, score, of_neighbours)
+        depth = torch.where(confidence > 0, 1 / inverse, 0.0)
+        maps.append(DepthMap(depth, confidence, K))
     return maps
 
 
-@torch.no_grad()
-def choose_neighbours(
-    viewmats: Tensor,  # [V, 4, 4]
-    Ks: Tensor,  # [V, 3, 3]
-    sizes: Tensor,  # [V, 2]
-    points: Tensor,  # [P, 3]
-    count: int = NEIGHBOURS,
-) -> Tensor:
-    """Choose the views with which each view is compared, given float64 arguments of `depths_in_views`.
-
-    Two views gain from every point that both see: less if the angle between their rays is too small or wide, or if one
-    sees the point larger. A view counts less if one that is chosen already lies in the same direction.
-
-    Returns:
-        Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]
-    """
-    depths = depths_in_views(points, viewmats, Ks, sizes)
-    seen = depths.isfinite()
-    centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
-    rays = F.normalize(points - centres[:, None], dim=2)  # [V, P, 3]
-    scales = Ks[:, :1, 0] / torch.where(seen, depths, 1.0)  # px per world unit. [V, P]
-    weights = []
-    for part in torch.arange(len(seen), device=seen.device).split(max(_TRIPLES // max(seen.numel(), 1), 1)):
-        angles = (rays[part, None] * rays).sum(dim=3).clamp(-1, 1).acos().rad2deg()  # [v, V, P]
-        weight = (angles / _BEST_ANGLES[0]).clamp_max(1)
-        weight *= ((_WIDEST_ANGLE - angles) / (_WIDEST_ANGLE - _BEST_ANGLES[1])).clamp(0, 1)
-        ratios = scales[part, None] / scales
-        weights.append((weight * torch.minimum(ratios, 1 / ratios) * (seen[part, None] & seen)).sum(dim=2))
-    weight = torch.cat(weights)  # [V, V]
-    weight = torch.where(weight < _SHARE * seen.sum(dim=1, keepdim=True), 0.0, weight).fill_diagonal_(0)
-    directions = F.normalize(centres - centres[:, None], dim=2)  # From each view to each. [V, V, 3]
-    chosen = torch.full((len(seen), count), -1, device=seen.device)
-    for i in range(min(count, len(seen))):
-        value, best = weight.max(dim=1)  # [V]
-        chosen[:, i] = torch.where(value > 0, best, -1)
-        direction = directions.gather(1, best[:, None, None].expand(-1, 1, 3))  # [V, 1, 3]
-        weight = weight * (1 - 0.5 * (directions * direction).sum(dim=2).clamp_min(0))
-        weight.scatter_(1, best[:, None], 0)
-    return chosen
+# --- preparing the views ---
 
 
-def _pyramid(image: Tensor, mask: Tensor | None, device: torch.device) -> list[Tensor]:
-    """Reduce an image [H, W, 3 or 4] and its mask, bool [H, W], to `_View.levels`."""
-    scale = 1 / 255 if image.dtype == torch.uint8 else 1.0
-    image = image.to(device).to(torch.float32) * scale
-    grey = image[..., :3].mean(dim=2)  # [H, W]
-    valid = image.new_ones(image.shape[:2], dtype=torch.bool)  # [H, W]
-    if image.shape[2] == 4:
-        grey = grey * image[..., 3]
-        valid = image[..., 3] >= 0.5
-    if mask is not None:
-        valid = valid & mask.to(device)
-    # Grey values lie around 0, so that float32 loses little in their moments.
-    level = torch.stack([torch.where(valid, grey - 0.5, 0.0), valid.to(grey)])[None]  # [1, 2, H, W]
-    # The coarsest level's stride divides the sides, so that a level's pixels are exact quarters of the next one's.
-    stride = 2 ** (LEVELS - 1)
-    factor = min(1.0, WORKING_SIDE / max(level.shape[2:])) / stride
-    size = [stride * max(round(side * factor), 1) for side in level.shape[2:]]
+def _pyramid(
+    image: Tensor,  # [H, W, 3 or 4]
+    mask: Tensor | None,  # bool [H, W]
+    device: torch.device,
+) -> list[Tensor]:
+    """Reduce an image and its mask to `_View.levels`."""
+    level = _grey_and_valid(image, mask, device)
+    size = _working_size(level.shape[2:])
     if size != list(level.shape[2:]):
-        level = _mean(F.interpolate(level, size, mode="bilinear", align_corners=False, antialias=True))
+        resized = F.interpolate(level, size, mode="bilinear", align_corners=False, antialias=True)
+        level = _mean(resized)
     levels = [level]
     for _ in range(LEVELS - 1):
-        levels.append(_mean(F.avg_pool2d(levels[-1], 2)))
+        halved = F.avg_pool2d(levels[-1], 2)
+        levels.append(_mean(halved))
     return [level[0] for level in levels]
 
 
-def _mean(sums: Tensor) -> Tensor:
+def _grey_and_valid(image: Tensor, mask: Tensor | None, device: torch.device) -> Tensor:
+    """Return grey values and 1 where they are valid, as in `_View.levels`, at full size. [1, 2, H, W]"""
+    scale = 1.0
+    if image.dtype == torch.uint8:
+        scale = 1 / 255
+    image = image.to(device).to(torch.float32) * scale
+    grey = image[..., :3].mean(dim=2)  # [H, W]
+    valid = image.new_ones(image.shape[:2], dtype=torch.bool)
+    if image.shape[2] == 4:
+        alpha = image[..., 3]
+        grey = grey * alpha
+        valid = alpha >= 0.5
+    if mask is not None:
+        valid = valid & mask.to(device)
+    # Grey values lie around 0, so that float32 loses little in their moments.
+    around_0 = torch.where(valid, grey - 0.5, 0.0)
+    return torch.stack([around_0, valid.to(grey)])[None]
+
+
+def _working_size(size: Sequence[int]) -> list[int]:
+    """Height and width at which depth is computed, given those of an image.
+
+    The coarsest level's stride divides them, so that a level's pixels are exact quarters of the next one's.
+    """
+    stride = 2 ** (LEVELS - 1)
+    reduction = WORKING_SIDE / max(size)
+    reduction = min(1.0, reduction)
+    factor = reduction / stride  # Sides of the coarsest level, relative to the image's
+    return [stride * max(round(side * factor), 1) for side in size]
+
+
+def _mean(
+    sums: Tensor,  # [1, 2, h, w]
+) -> Tensor:
     """Mean of valid grey values, from weighted sums of `_View.levels`; half of the weight is enough. [1, 2, h, w]"""
-    valid = (sums[:, 1:] >= 0.5).to(sums)
-    return torch.cat([sums[:, :1] / sums[:, 1:].clamp_min(0.5) * valid, valid], dim=1)
+    grey = sums[:, :1]
+    weight = sums[:, 1:]
+    is_valid = weight >= 0.5
+    valid = is_valid.to(sums)
+    divisor = weight.clamp_min(0.5)
+    mean = grey / divisor * valid
+    return torch.cat([mean, valid], dim=1)
 
 
 def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tensor) -> list[_View]:
     """Find neighbours and ranges of depth. Arguments as `choose_neighbours`; float64; only points on the device."""
-    points = points[:: math.ceil(max(len(points), 1) / _POINTS)].to(torch.float64)
-    placed = viewmats.to(points.device), Ks.to(points.device), sizes.to(points.device)
+    device = points.device
+    every = math.ceil(max(len(points), 1) / _POINTS)
+    points = points[::every].to(torch.float64)
+    placed = (viewmats.to(device), Ks.to(device), sizes.to(device))
     neighbours = choose_neighbours(*placed, points).tolist()
-    depths = depths_in_views(points, *placed)
-    # No quantile is known of nothing.
-    depths = F.pad(torch.where(depths.isfinite(), depths, torch.nan), (0, 1), value=torch.nan)
-    ranges = depths.nanquantile(depths.new_tensor([0.005, 0.99]), dim=1).T.tolist()
+    ranges = _depth_ranges(depths_in_views(points, *placed))
+    projections = _projections(viewmats, Ks, sizes)
+    inverses = projections.inverse()
+    centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
+    views = []
+    for v, levels in enumerate(pyramids):
+        chosen = [n for n in neighbours[v] if n >= 0]
+        to = projections[chosen] @ inverses[v]  # [N, 4, 4]
+        back = projections[v] @ inverses[chosen]
+        to = to[:, :3].to(device, torch.float32)
+        back = back[:, :3].to(device, torch.float32)
+        nearest, farthest = ranges[v]
+        inverse = (0.5 / farthest, 1.5 / nearest)  # Surfaces without points may lie nearer and farther.
+        baselines = (centres[chosen] - centres[v]).norm(dim=1)
+        motions = Ks[chosen, 0, 0] * baselines  # px per inverse depth. [N]
+        step = 1 / max(motions.tolist(), default=1.0)
+        views.append(_View(levels, chosen, to, back, inverse, step))
+    return views
+
+
+def _depth_ranges(
+    depths: Tensor,  # infinite outside the images [V, P]
+) -> list[list[float]]:
+    """Depths of the nearest and farthest points of each view, without the outermost; NaN if it sees none. [V][2]"""
+    known = torch.where(depths.isfinite(), depths, torch.nan)
+    # torch knows no quantile of nothing.
+    known = F.pad(known, (0, 1), value=torch.nan)
+    shares = depths.new_tensor([0.005, 0.99])
+    return known.nanquantile(shares, dim=1).T.tolist()
+
+
+def _projections(viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> Tensor:
+    """Matrices from world space to homogeneous places in pictures that span [−1, 1]². float64 [V, 4, 4]"""
     cameras = torch.eye(4, dtype=torch.float64).repeat(len(Ks), 1, 1)  # In a camera's axes → [−1, 1]². [V, 4, 4]
     cameras[:, :2, :3] = Ks[:, :2] * (2 / sizes[:, :, None])
     cameras[:, :2, 2] -= 1
-    projections = cameras @ viewmats  # [V, 4, 4]
-    inverses = projections.inverse()
-    centres = viewmats.inverse()[:, :3, 3]
-    views = []
-    for v, levels in enumerate(pyramids):
-        near = [n for n in neighbours[v] if n >= 0]
-        to = projections[near] @ inverses[v]  # [N, 4, 4]
-        back = projections[v] @ inverses[near]  # [N, 4, 4]
-        to, back = (matrices[:, :3].to(points.device, torch.float32) for matrices in (to, back))
-        inverse = 0.5 / ranges[v][1], 1.5 / ranges[v][0]  # Surfaces without points may lie nearer and farther.
-        motions = Ks[near, 0, 0] * (centres[near] - centres[v]).norm(dim=1)  # px per inverse depth. [N]
-        views.append(_View(levels, near, to, back, inverse, 1 / max(motions.tolist(), default=1.0)))
-    return views
+    return cameras @ viewmats
+
+
+# --- the sweep ---
 
 
 def _solve(view: _View, views: list[_View]) -> tuple[Tensor, Tensor]:
     """Inverse depth of a view, 0 where it is unknown, and its score. Each [h, w]"""
+    finest_valid = view.levels[0][1]
     if not view.neighbours:
-        return torch.zeros_like(view.levels[0][0]), torch.zeros_like(view.levels[0][0])
+        return torch.zeros_like(finest_valid), torch.zeros_like(finest_valid)
+    device = view.to.device
     smallest, largest = view.inverse
-    count = min(max(math.ceil((largest - smallest) / (view.step * 2 ** (LEVELS - 1))), 8), HYPOTHESES)
+    # A step moves a pixel of the coarsest level by about 1 px.
+    wanted = math.ceil((largest - smallest) / (view.step * 2 ** (LEVELS - 1)))
+    count = max(wanted, 8)
+    count = min(count, HYPOTHESES)
     step = (largest - smallest) / count
-    hypotheses = smallest + step * torch.arange(count + 1, device=view.to.device)[:, None, None]  # [D, 1, 1]
-    peak, score = _peak(_scores(view, views, LEVELS - 1, hypotheses))
+    numbers = torch.arange(count + 1, device=device)[:, None, None]  # [D, 1, 1]
+    peak, score = _peak(_scores(view, views, LEVELS - 1, smallest + step * numbers))
     inverse = smallest + step * peak  # [h, w]
-    around = torch.arange(-2, 3, device=view.to.device)[:, None, None]  # [5, 1, 1]
+    around = torch.arange(-2, 3, device=device)[:, None, None]  # [5, 1, 1]
     for level in reversed(range(LEVELS - 1)):
-        inverse = F.interpolate(inverse[None, None], scale_factor=2, mode="bilinear", align_corners=False)[0, 0]
+        enlarged = F.interpolate(inverse[None, None], scale_factor=2, mode="bilinear", align_corners=False)
+        inverse = enlarged[0, 0]
         step /= 2  # Pixels are half as large, and the five hypotheses reach as far as the last step.
         peak, score = _peak(_scores(view, views, level, inverse + step * around))
-        inverse = inverse + step * (peak - 2)
-    known = (score > SCORES[0]) & (inverse > 0) & (view.levels[0][1] > 0)
+        correction = step * (peak - 2)
+        inverse = inverse + correction
+    known = score > SCORES[0]
+    known &= inverse > 0
+    known &= finest_valid > 0
     return torch.where(known, inverse, 0.0), score
 
 
-def _scores(view: _View, views: list[_View], level: int, inverse: Tensor) -> Tensor:
-    """Smoothed mean of the two best correlations with neighbours: a pixel may be hidden in the others.
+def _scores(
+    view: _View,
+    views: list[_View],
+    level: int,
+    inverse: Tensor,  # inverse depths of each pixel [D, h, w], or of all [D, 1, 1]
+) -> Tensor:
+    """Smoothed mean of the two best correlations with neighbours, in [−1, 1]. [D, h, w]
 
-    The inverse depths are those of each pixel [D, h, w], or of all [D, 1, 1]. The scores lie in [−1, 1]. [D, h, w]
+    Only two count, because a pixel may be hidden in the others.
     """
-    pairs = zip(view.neighbours, view.to, strict=True)
     image = view.levels[level]
-    best, *others = (_correlation(image, views[n].levels[level], matrix, inverse) for n, matrix in pairs)
+    correlations = []
+    for n, matrix in zip(view.neighbours, view.to, strict=True):
+        correlations.append(_correlation(image, views[n].levels[level], matrix, inverse))
+    best = correlations[0]
     second = torch.full_like(best, -1.0)
-    for score in others:
+    for score in correlations[1:]:
         second = torch.maximum(second, torch.minimum(best, score))
         best = torch.maximum(best, score)
     scores = torch.where(second > -1, 0.5 * (best + second), best)
     return F.avg_pool2d(scores, SMOOTHING, 1, SMOOTHING // 2, count_include_pad=False)
 
 
-def _correlation(image: Tensor, neighbour: Tensor, matrix: Tensor, inverse: Tensor) -> Tensor:
+def _correlation(
+    image: Tensor,  # a level of a view [2, h, w]
+    neighbour: Tensor,  # the same level of its neighbour [2, H, W]
+    matrix: Tensor,  # of `_View.to` [3, 4]
+    inverse: Tensor,  # inverse depths [D, h, w] or [D, 1, 1]
+) -> Tensor:
     """NCC of the windows around pixels and around their places in a neighbour, over what is valid in both. [D, h, w]
 
-    The arguments are a level of a view [2, h, w], the same level of its neighbour [2, H, W], `_View.to` [3, 4], and
-    inverse depths [D, h, w] or [D, 1, 1]. If less than half a window is valid, it is −1, as for the worst match.
+    If less than half a window is valid, it is −1, as for the worst match.
     """
-    places = _project(matrix, *_pixels(image), inverse)[0].movedim(0, -1)  # [D, h, w, 2]
-    sampled = F.grid_sample(neighbour.expand(len(places), -1, -1, -1), places, align_corners=False)  # [D, 2, h, w]
+    x, y = _pixels(image)
+    places = _project(matrix, x, y, inverse)[0]  # Memory for the depths, which are large, is free again.
+    grid = places.movedim(0, -1)  # [D, h, w, 2]
+    sampled = F.grid_sample(neighbour.expand(len(grid), -1, -1, -1), grid, align_corners=False)  # [D, 2, h, w]
     value = image[0]
     other = sampled[:, 0]
     # The weight, both values and their products share two passes of the box filter.
@@ -269,12 +318,17 @@ def _correlation(image: Tensor, neighbour: Tensor, matrix: Tensor, inverse: Tens
     variance = torch.addcmul(square, mean, mean, value=-1).add_(NOISE**2)
     other_variance = torch.addcmul(other_square, other_mean, other_mean, value=-1).add_(NOISE**2)
     covariance = torch.addcmul(product, mean, other_mean, value=-1)
-    return covariance.div_(variance.mul_(other_variance).sqrt_()).masked_fill_(weight <= 0.5, -1.0)
+    deviations = variance.mul_(other_variance).sqrt_()
+    return covariance.div_(deviations).masked_fill_(weight <= 0.5, -1.0)
 
 
-def _pixels(image: Tensor) -> tuple[Tensor, Tensor]:
-    """Places of the pixels of a picture [..., h, w]: x [1, w] and y [h, 1]."""
-    y, x = ((2 * torch.arange(side, device=image.device) + 1) / side - 1 for side in image.shape[-2:])
+def _pixels(
+    image: Tensor,  # [..., h, w]
+) -> tuple[Tensor, Tensor]:
+    """Places of the pixels of a picture: x [1, w] and y [h, 1], in [−1, 1]."""
+    height, width = image.shape[-2:]
+    x = (2 * torch.arange(width, device=image.device) + 1) / width - 1
+    y = (2 * torch.arange(height, device=image.device) + 1) / height - 1
     return x[None], y[:, None]
 
 
@@ -286,35 +340,72 @@ def _project(matrix: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Ten
     """
     a, b, c, shift = matrix[:, :, None, None].unbind(1)  # Each [3, 1, 1]
     # No matrix product, since TF32 would round it to 10 bits.
-    moved = torch.addcmul((a * x + b * y + c)[:, None], shift[:, None], inverse)  # [3, D, h, w]
+    at_infinity = a * x + b * y + c  # [3, h, w]
+    moved = torch.addcmul(at_infinity[:, None], shift[:, None], inverse)  # [3, D, h, w]
     depth = moved[2].clamp_min(_TINY)
     return moved[:2] / depth, depth
 
 
-def _peak(scores: Tensor) -> tuple[Tensor, Tensor]:
-    """Index of the best score among [D, h, w], refined by the parabola through it and those beside; and the score."""
+def _peak(
+    scores: Tensor,  # [D, h, w]
+) -> tuple[Tensor, Tensor]:
+    """Index of the best score, refined by the parabola through it and those beside; and the score. Each [h, w]"""
+    last = len(scores) - 1
     score, index = scores.max(dim=0, keepdim=True)
     before = scores.gather(0, (index - 1).clamp_min(0))
-    after = scores.gather(0, (index + 1).clamp_max(len(scores) - 1))
-    offset = 0.5 * (after - before) / (2 * score - before - after).clamp_min(_TINY)
-    offset = torch.where((index > 0) & (index < len(scores) - 1), offset, 0.0)
+    after = scores.gather(0, (index + 1).clamp_max(last))
+    curvature = (2 * score - before - after).clamp_min(_TINY)
+    slope = 0.5 * (after - before)
+    offset = slope / curvature
+    is_inside = index > 0
+    is_inside &= index < last
+    offset = torch.where(is_inside, offset, 0.0)
     return (index + offset)[0], score[0]
 
 
-def _confidence(view: _View, inverse: Tensor, score: Tensor, others: list[Tensor]) -> Tensor:
-    """Confidence in a view's inverse depths [h, w] by their score [h, w] and the neighbours' inverse depths. [h, w]"""
-    x, y = _pixels(inverse)
+# --- what is trusted ---
+
+
+def _confidence(
+    view: _View,
+    inverse: Tensor,  # the view's inverse depths [h, w]
+    score: Tensor,  # [h, w]
+    others: list[Tensor],  # the neighbours' inverse depths [h, w]
+) -> Tensor:
+    """Confidence in a view's inverse depths, in [0, 1]: by their score, and by how many neighbours agree. [h, w]"""
     agreeing = torch.zeros_like(inverse)
     for to, back, other in zip(view.to, view.back, others, strict=True):
-        places, depth = _project(to, x, y, inverse[None])  # [2, 1, h, w], [1, h, w]
-        # The nearest pixel's depth is read, since a mean of two surfaces is none.
-        found = F.grid_sample(other[None, None], places.movedim(0, -1), mode="nearest", align_corners=False)[0]
-        returned, _ = _project(back, places[0, 0], places[1, 0], found)
-        x_error = (returned[0] - x) * (0.5 * x.numel())  # px. [1, h, w]
-        y_error = (returned[1] - y) * (0.5 * y.numel())  # px. [1, h, w]
-        near = torch.hypot(x_error, y_error) < PIXEL_TOLERANCE
-        agreeing += (near & ((found * depth / inverse - 1).abs() < DEPTH_TOLERANCE))[0]
-    most = min(len(others), AGREEING)
-    enough = (agreeing >= (2 if most > 2 else 1)) & (inverse > 0)
-    confidence = ((score - SCORES[0]) / (SCORES[1] - SCORES[0])).clamp(0, 1) * (agreeing / max(most, 1)).clamp_max(1)
+        agreeing += _agrees(inverse, other, to, back)
+    num_neighbours = len(others)
+    most = min(num_neighbours, AGREEING)
+    needed = 1
+    if most > 2:
+        needed = 2
+    enough = agreeing >= needed
+    enough &= inverse > 0
+    low, high = SCORES
+    by_score = ((score - low) / (high - low)).clamp(0, 1)
+    by_neighbours = agreeing / max(most, 1)
+    by_neighbours = by_neighbours.clamp_max(1)
+    confidence = by_score * by_neighbours
     return torch.where(enough, confidence, 0.0)
+
+
+def _agrees(
+    inverse: Tensor,  # inverse depths of a view [h, w]
+    other: Tensor,  # inverse depths of its neighbour [H, W]
+    to: Tensor,  # [3, 4]
+    back: Tensor,  # [3, 4]
+) -> Tensor:
+    """Tell for each pixel of a view whether a neighbour's depth agrees with its own. bool [h, w]"""
+    x, y = _pixels(inverse)
+    places, depth = _project(to, x, y, inverse[None])  # [2, 1, h, w], [1, h, w]
+    # The nearest pixel's depth is read, since a mean of two surfaces is none.
+    grid = places.movedim(0, -1)
+    found = F.grid_sample(other[None, None], grid, mode="nearest", align_corners=False)[0]  # [1, h, w]
+    returned, _ = _project(back, places[0, 0], places[1, 0], found)
+    x_error = (returned[0] - x) * (0.5 * x.numel())  # px. [1, h, w]
+    y_error = (returned[1] - y) * (0.5 * y.numel())
+    returns = torch.hypot(x_error, y_error) < PIXEL_TOLERANCE
+    is_as_deep = (found * depth / inverse - 1).abs() < DEPTH_TOLERANCE
+    return (returns & is_as_deep)[0]

@@ -32,7 +32,8 @@ def wavelength(
     structure_tensor: Tensor,  # [..., 3]
 ) -> Tensor:
     """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) in px of S̄ in 1/px², in (0, 1/ε] (paper, section 3.3). [...]"""
-    frequency = principal_eigenvalue(structure_tensor).clamp_min(0).sqrt()  # 1/px
+    eigenvalue = principal_eigenvalue(structure_tensor)
+    frequency = eigenvalue.clamp_min(0).sqrt()  # 1/px
     return 1.0 / (frequency + WAVELENGTH_EPSILON)
 
 
@@ -102,8 +103,10 @@ def sample_footprint(
     factor_xy = torch.maximum(torch.minimum(factor_xy, limit), -limit)
     factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
     # A uniform point in the disc of radius 2.
-    radius = 2.0 * jitter[:, 0].sqrt()
-    angle = 2.0 * torch.pi * jitter[:, 1]
+    share_of_area = jitter[:, 0]
+    turn = jitter[:, 1]
+    radius = 2.0 * share_of_area.sqrt()
+    angle = 2.0 * torch.pi * turn
     u = radius * angle.cos()
     v = radius * angle.sin()
     offsets = torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], dim=-1)  # [M, 2]
@@ -122,10 +125,10 @@ def _footprint_covariances(conics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # The conic of a Gaussian too large for float32 is 0.
     known = known.clamp_min(torch.finfo(known.dtype).tiny)
     determinant = torch.where(determinant.isfinite(), known, torch.nan)
-    xx = (c / determinant - SCREEN_BLUR).clamp_min(0)
-    yy = (a / determinant - SCREEN_BLUR).clamp_min(0)
+    xx = c / determinant - SCREEN_BLUR
+    yy = a / determinant - SCREEN_BLUR
     xy = -b / determinant
-    return xx, xy, yy
+    return xx.clamp_min(0), xy, yy.clamp_min(0)
 
 
 def sample_map(

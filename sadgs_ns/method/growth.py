@@ -84,8 +84,9 @@ def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) 
     violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)  # [N, 3]
     is_opaque = opacities(params) >= options.split_min_opacity  # [N]
     violates &= is_opaque[:, None]
-    worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
-    counts = children_per_axis(state["eta_max"], violates)
+    eta_max = state["eta_max"]  # [N, 3]
+    worst = torch.where(violates, eta_max, 0.0).amax(dim=1)  # [N]
+    counts = children_per_axis(eta_max, violates)
     split_into_grid = partial(grid_split, child_scale=options.child_scale)
     return Proposal(counts, worst, split_into_grid)
 
@@ -99,8 +100,10 @@ def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposa
     scales = params["scales"].detach()
     count = state["grad_count"].clamp_min(1)
     is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
-    clone_ratio = state["grad2d"] / count / options.clone_grad2d
-    split_ratio = state["absgrad2d"] / count / options.split_absgrad2d
+    mean_gradient = state["grad2d"] / count
+    mean_absolute = state["absgrad2d"] / count
+    clone_ratio = mean_gradient / options.clone_grad2d
+    split_ratio = mean_absolute / options.split_absgrad2d
     steepness = torch.where(is_small, clone_ratio, split_ratio)  # From 1 on a Gaussian grows. [N]
     grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
     is_split = grows & ~is_small

@@ -35,7 +35,9 @@ def quantize(
     product = frequencies[..., 0] * frequencies[..., 1]  # √(xx yy)
     divisor = product.clamp_min(torch.finfo(product.dtype).tiny)
     correlation = torch.where(product > 0, xy / divisor, 0.0)
-    middle = (127 + 127 * correlation.clamp(-1, 1)).round()
+    correlation = correlation.clamp(-1, 1)
+    middle = 127 + 127 * correlation
+    middle = middle.round()
     invalid = tensor.isnan().any(-1)
     first, last = torch.where(invalid[..., None], 0.0, rounded).unbind(-1)
     middle = torch.where(invalid, INVALID, middle)
@@ -49,7 +51,8 @@ def dequantize(
     first, middle, last = quantized.float().unbind(-1)
     x = _decode_frequency(first)  # √xx
     y = _decode_frequency(last)  # √yy
-    xy = x * y * (middle - 127) / 127
+    numerator = middle - 127  # The correlation is this over 127.
+    xy = x * y * numerator / 127
     decoded = torch.stack([x * x, xy, y * y], -1)
     is_invalid = quantized[..., 1:2] == INVALID
     return torch.where(is_invalid, torch.nan, decoded)

@@ -263,10 +263,12 @@ class RunningStrategy(Strategy):
         proposal = rule.propose(self.options, params, state)
         growth = proposal.growth
         in_memory = self._room_in_memory(params, state, views)
-        under_cap = self.options.max_gaussians - self.world.sums(len(params["means"]))[0]
+        num_present = self.world.sums(len(params["means"]))[0]
+        under_cap = self.options.max_gaussians - num_present
         allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
         wanted = self.world.sums(int(growth.sum()))[0]
-        if in_memory < min(wanted, under_cap):
+        allowed_by_cap = min(wanted, under_cap)
+        if in_memory < allowed_by_cap:
             warnings.warn(
                 f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are "
                 "added. Lower max_gaussians, use smaller images, or end other programs on the device.",

@@ -76,7 +76,8 @@ def schedule(
     visits = _view_visits(num_views, effort)
     if views_per_iteration is None:
         affordable = int(visits) // STEPS_BEFORE_VIEWS
-        views_per_iteration = min(max(affordable, 1), MOST_VIEWS)
+        affordable = min(affordable, MOST_VIEWS)
+        views_per_iteration = max(affordable, 1)
     views_per_iteration = min(views_per_iteration, num_views)
     if iterations is None:
         iterations = math.ceil(visits / views_per_iteration)
@@ -89,8 +90,10 @@ def _view_visits(num_views: int, effort: float) -> float:
     if effort > 1:
         few, many = MORE_VISITS_FROM
         power = (num_views - few) / (many - few)
-        power = min(max(power, 0.0), 1.0)
-    return effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+        power = max(power, 0.0)
+        power = min(power, 1.0)
+    visits = BASE_VISITS + VISITS_PER_VIEW * num_views
+    return effort**power * visits
 
 
 @lru_cache(maxsize=64)
@@ -102,14 +105,16 @@ def windows(iterations: int, **given: int | None) -> Windows:
     runs of fewer than `RESETS_FROM` iterations. Densification ends after at most 19/30 of the run; where that is before
     `refine_start_iter`, there is none. Raises TypeError if another name is given.
     """
-    part = max(round(iterations / _PARTS), 1)
+    part = round(iterations / _PARTS)
+    part = max(part, 1)
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}
     if iterations < RESETS_FROM:
         derived["reset_every"] = 0
     chosen = {name: value for name, value in given.items() if value is not None}
     result = Windows(**(derived | chosen))
     numerator, denominator = LATEST_STOP
-    stop = min(result.refine_stop_iter, iterations * numerator // denominator)
+    latest = iterations * numerator // denominator
+    stop = min(result.refine_stop_iter, latest)
     if stop < result.refine_start_iter:
         stop = 0
     return replace(result, refine_stop_iter=stop)

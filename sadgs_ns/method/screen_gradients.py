@@ -42,9 +42,9 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     if gradient is None:
         gradient = means2d.grad
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
-    scale_x = info["width"] / 2.0 * num_views
-    scale_y = info["height"] / 2.0 * num_views
-    scales = (scale_x, scale_y)
+    half_width = info["width"] / 2.0
+    half_height = info["height"] / 2.0
+    scales = (half_width * num_views, half_height * num_views)
     if use_triton(means2d):
         from sadgs_ns.kernels import screen_gradients as kernel
 

@@ -73,9 +73,12 @@ def _narrowing(n: Tensor, child_scale: float) -> Tensor:
     The grid's variance is 1 − 1/n² of the parent's, and the children's (k/n)². An axis that is not split has one cell
     in the middle, so its factor does not matter. [Q, 3]
     """
-    wanted = 1 - (child_scale / n) ** 2
-    present = 1 - (1 / n) ** 2
-    return (wanted / present.clamp_min(0.75)).clamp_min(0).sqrt()
+    child = child_scale / n  # A child's standard deviation, in the parent's
+    cell = 1 / n
+    wanted = 1 - child**2
+    present = 1 - cell**2
+    ratio = wanted / present.clamp_min(0.75)
+    return ratio.clamp_min(0).sqrt()
 
 
 def _share_opacity(

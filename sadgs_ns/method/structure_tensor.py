@@ -56,7 +56,8 @@ def gaussian_kernel(
     kernel = kernel / kernel.sum()
     if order == 1:
         kernel = x * kernel
-        kernel = kernel / (x * kernel).sum()
+        slope = (x * kernel).sum()
+        kernel = kernel / slope
     return kernel.to(device=device, dtype=dtype)
 
 
@@ -164,7 +165,8 @@ def _floors_of_contrast(
     levels: list[float],  # σ_l in px
 ) -> tuple[list[Tensor], Tensor]:
     """ε of eq. 3 for each level, and ε of eq. 5, relative to the contrast of each image. [B, 1, 1, 1] each"""
-    noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)
+    noise = noise_floor * contrast
+    noise = noise.clamp_min(_ROUNDING_FLOOR)
     trace_floors = [(noise / sigma) ** 2 for sigma in levels]
     return trace_floors, noise**GAMMA
 
@@ -178,8 +180,10 @@ def _floors_of_epsilon(
     The image was divided by its brightest value, so S_l was by its square, and E_l^γ by its power.
     """
     smallest = torch.finfo(brightest.dtype).tiny
-    trace_floor = (epsilon / brightest.square()).clamp_min(smallest)
-    weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
+    trace_floor = epsilon / brightest.square()
+    trace_floor = trace_floor.clamp_min(smallest)
+    weight_floor = epsilon / brightest**GAMMA
+    weight_floor = weight_floor.clamp_min(smallest)
     return [trace_floor] * NUM_LEVELS, weight_floor
 
 
@@ -232,7 +236,8 @@ def _normalise(
     # Every operator is blind to a constant, and without it float32 rounds relative to the contrast, not the brightness.
     image = (image - mean) * valid
     squares = image.square().sum(dim=1, keepdim=True)  # [B, 1, H, W]
-    contrast = (squares.sum(dim=(2, 3), keepdim=True) / count).sqrt()
+    variance = squares.sum(dim=(2, 3), keepdim=True) / count
+    contrast = variance.sqrt()
     return image, brightest, contrast
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -24,7 +24,8 @@ Params = Mapping[str, Tensor] | torch.nn.ParameterDict
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
 takes the place of the statistics and of a split's copy, which are gone by then."""
-ACTIVATION_BYTES = 16  # Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4
+ACTIVATION_BYTES = 16
+"""Bytes of a Gaussian in every phase: exp(scales) 12, sigmoid(opacities) 4."""
 ACTIVATION_GRADIENT_BYTES = 28
 """Bytes of a Gaussian in the backward pass: gradients of the activations 16, the means' from harmonics 12."""
 PROJECTION_BYTES = 52
@@ -41,7 +42,8 @@ numbers that are gathered, sent, received and taken apart 48 each. Every Gaussia
 PAIR_SORT_BYTES = 40
 """Bytes of a pair of a Gaussian and a tile while pairs are sorted by tile, with tiles of 32 bits: tiles 4, Gaussians 4,
 sorted tiles 4, indices before 8 and after 8 the sort, the sort's buffers 12. With tiles of 16 bits they are 34."""
-PAIR_BYTES = 4  # Bytes of such a pair until the end of the step: the Gaussian in the tile's list
+PAIR_BYTES = 4
+"""Bytes of such a pair until the end of the step: the Gaussian in the tile's list."""
 PIXEL_BYTES = 54
 """Bytes of a pixel in the backward pass of rasterization: the rendered colours 12 and those on the background 12,
 alphas 4, last Gaussians 4, gradient of the colours 12 and of alphas 4, image in bytes 3, quantized S̄ 3."""
@@ -50,7 +52,8 @@ LOSS_PIXEL_BYTES = 162
 Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, quantized S̄ 3."""
 TORCH_LOSS_PIXEL_BYTES = 300
 """The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
-PAIRS_PER_GAUSSIAN = 12  # Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox
+PAIRS_PER_GAUSSIAN = 12
+"""Pairs, of tiles of 8 px, that a trained Gaussian has in a view: 10.5 were counted on fox."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,23 @@ class StepSize:
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
-        """The size of a step that was rendered, from gsplat's or `distributed.rasterization`'s `info` of its views."""
-        return cls(
-            sum(info["n_cameras"] for info in infos),
-            sum(info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"]) for info in infos),
-            sum(info["num_pairs"] if "num_pairs" in info else len(info["flatten_ids"]) for info in infos),
-            any("num_pairs" in info for info in infos),
-        )
+        """Return the size of a step that was rendered, from `info` of its views.
+
+        It is gsplat's, or that of `distributed.rasterization`, which alone has `num_pairs`.
+        """
+        views = 0
+        pixels = 0
+        pairs = 0
+        exchanged = False
+        for info in infos:
+            views += info["n_cameras"]
+            pixels += info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"])
+            if "num_pairs" in info:
+                exchanged = True
+                pairs += info["num_pairs"]
+            else:
+                pairs += len(info["flatten_ids"])
+        return cls(views, pixels, pairs, exchanged)
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
@@ -80,64 +93,90 @@ def available_bytes(device: torch.device) -> tuple[float, float]:
     if device.type != "cuda":
         return math.inf, math.inf
     left, total = torch.cuda.mem_get_info(device)
-    return float(left + torch.cuda.memory_reserved(device)), float(total)
+    available = left + torch.cuda.memory_reserved(device)
+    return float(available), float(total)
 
 
 def free_bytes(device: torch.device) -> float:
     """Bytes that new tensors may take: free in the driver, or kept unused by torch; infinite without CUDA."""
     available, _ = available_bytes(device)
-    return available - torch.cuda.memory_allocated(device) if device.type == "cuda" else available
+    if device.type != "cuda":
+        return available
+    return available - torch.cuda.memory_allocated(device)
 
 
 def kept_bytes(params: Params, state: Mapping[str, Any]) -> int:
     """Bytes that one Gaussian keeps: its parameters, their gradients and moments, and its statistics in `state`."""
-    tensors = [value for value in state.values() if isinstance(value, Tensor)]
-    return COPIES * sum(map(_row_bytes, params.values())) + sum(map(_row_bytes, tensors))
+    of_params = sum(_row_bytes(parameter) for parameter in params.values())
+    of_state = sum(_row_bytes(value) for value in state.values() if isinstance(value, Tensor))
+    return COPIES * of_params + of_state
 
 
 def widest_bytes(params: Params) -> int:
     """Bytes of a Gaussian's widest parameter; while a split copies it to its new length, memory holds it twice."""
-    return max(map(_row_bytes, params.values()))
+    return max(_row_bytes(parameter) for parameter in params.values())
 
 
 def step_bytes(num_gaussians: int, size: StepSize, device: torch.device) -> dict[str, float]:
     """Bytes that a step of Gaussians, visible or not, takes at its peak in each phase, besides `kept_bytes`."""
-    return {name: a * num_gaussians + b + p * size.pairs for name, (a, b, p) in _phases(size, device).items()}
+    taken = {}
+    for name, phase in _phases(size, device).items():
+        taken[name] = phase.per_gaussian * num_gaussians + phase.of_pixels + phase.per_pair * size.pairs
+    return taken
 
 
 def affordable_growth(params: Params, state: Mapping[str, Any], free: float, size: StepSize) -> float:
-    """How many Gaussians may be added so that adding them and the next training step fit; ≥ 0, or infinity.
+    """Return how many Gaussians may be added so that adding them and the next training step fit; ≥ 0, or infinity.
 
     Added Gaussians bring `PAIRS_PER_GAUSSIAN` pairs each in every view.
 
     Args:
+        params: The present Gaussians' parameters.
+        state: The strategy's state, whose tensors hold a row for each Gaussian.
         free: Bytes left, as `free_bytes` counts them.
         size: The next step's, with the pairs of the present Gaussians.
     """
     if math.isinf(free):
         return free
-    n = len(params["means"])
+    num_present = len(params["means"])
     widest = widest_bytes(params)
-    new_pairs = PAIRS_PER_GAUSSIAN * size.views
     kept = kept_bytes(params, state)
-    growth = min(
-        (free - n * (a + widest) - b - p * size.pairs) / (kept + widest + a + p * new_pairs)
-        for a, b, p in _phases(size, params["means"].device).values()
-    )
+    new_pairs = PAIRS_PER_GAUSSIAN * size.views
+    growth = math.inf
+    for phase in _phases(size, params["means"].device).values():
+        of_present = num_present * (phase.per_gaussian + widest)
+        left = free - of_present - phase.of_pixels - phase.per_pair * size.pairs
+        each = kept + widest + phase.per_gaussian + phase.per_pair * new_pairs
+        growth = min(growth, left / each)
     return max(math.floor(growth), 0)
 
 
-def _phases(size: StepSize, device: torch.device) -> dict[str, tuple[float, float, float]]:
-    """Bytes per Gaussian, bytes besides and bytes per pair, in each phase."""
-    projected = ACTIVATION_BYTES + (PROJECTION_BYTES + EXCHANGE_BYTES * size.exchanged) * size.views
-    loss = LOSS_PIXEL_BYTES if use_triton(device) else TORCH_LOSS_PIXEL_BYTES
+class _Phase(NamedTuple):
+    """The bytes that a phase of a step takes."""
+
+    per_gaussian: float
+    of_pixels: float
+    per_pair: float  # For each pair of a Gaussian and a tile
+
+
+def _phases(size: StepSize, device: torch.device) -> dict[str, _Phase]:
+    """Bytes that each phase of a step takes, besides what Gaussians keep."""
+    per_view = PROJECTION_BYTES
+    if size.exchanged:
+        per_view += EXCHANGE_BYTES
+    projected = ACTIVATION_BYTES + per_view * size.views
+    sorted_by_depth = projected + DEPTH_SORT_BYTES * size.views
     gradients = ACTIVATION_GRADIENT_BYTES + PROJECTION_GRADIENT_BYTES * size.views
+    loss_pixel = TORCH_LOSS_PIXEL_BYTES
+    if use_triton(device):
+        loss_pixel = LOSS_PIXEL_BYTES
     return {
-        "tile lists": (projected + DEPTH_SORT_BYTES * size.views, 0.0, PAIR_SORT_BYTES),
-        "loss": (projected, loss * size.pixels, PAIR_BYTES),
-        "backward": (projected + gradients, PIXEL_BYTES * size.pixels, PAIR_BYTES),
+        "tile lists": _Phase(sorted_by_depth, 0.0, PAIR_SORT_BYTES),
+        "loss": _Phase(projected, loss_pixel * size.pixels, PAIR_BYTES),
+        "backward": _Phase(projected + gradients, PIXEL_BYTES * size.pixels, PAIR_BYTES),
     }
 
 
 def _row_bytes(tensor: Tensor) -> int:
+    """Bytes of a row of a tensor [N, ...]."""
     return math.prod(tensor.shape[1:]) * tensor.element_size()

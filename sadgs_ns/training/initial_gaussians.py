@@ -10,7 +10,8 @@ import torch
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
 from torch import Tensor
 
-from sadgs_ns.geometry.initialization import plausible_points, starting_points
+from sadgs_ns.geometry.extents import plausible_points
+from sadgs_ns.geometry.initialization import starting_points
 from sadgs_ns.geometry.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.run.progress import warn

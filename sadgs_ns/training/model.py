@@ -19,7 +19,8 @@ from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
-from sadgs_ns.geometry.initialization import camera_extent, neighbour_scales
+from sadgs_ns.geometry.extents import camera_extent
+from sadgs_ns.geometry.initialization import neighbour_scales
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.running_strategy import RunningStrategy

@@ -5,13 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sadgs_ns.geometry.initialization import (
-    bounding_box_points,
-    camera_extent,
-    neighbour_scales,
-    plausible_points,
-    starting_points,
-)
+from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales, starting_points
 
 
 def test_points_lie_on_the_six_faces():
@@ -44,12 +38,6 @@ def test_few_or_equal_points_have_finite_log_scales(points: list[list[float]]):
     assert scales.log().isfinite().all()
 
 
-def test_camera_extent_is_that_of_3dgs():
-    positions = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [1.0, 0, 0]])
-    assert camera_extent(positions) == pytest.approx(1.1)
-    assert camera_extent(positions[:1]) == 1.0
-
-
 def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them():
     points, colors = torch.rand((2, 20, 3), generator=torch.Generator().manual_seed(0))
     alone = starting_points(points, colors, faces=False)
@@ -61,30 +49,3 @@ def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them(
     ):
         assert torch.equal(value[:20], before) and len(value) == 20 + len(faces)
         torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
-
-
-@pytest.mark.hard_case("one wild camera", "does not count for the extent")
-def test_one_wild_camera_does_not_decide_the_extent():
-    positions = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
-    expected = camera_extent(positions)
-    for far in (1e2, 1e6, 1e30, torch.inf, torch.nan):
-        assert camera_extent(torch.cat([positions, torch.full((1, 3), far)])) == expected
-
-
-@pytest.mark.hard_case("one wild SfM point", "is left out and counted; all others stay")
-@pytest.mark.parametrize("number", [4, 60, 2_000])
-@pytest.mark.parametrize("far", [[1e5, 0, 0], [1e30, -1e30, 1e30], [torch.inf, 0, 0], [0, torch.nan, 0]])
-def test_a_wild_point_is_not_plausible_and_all_others_are(number: int, far: list[float]):
-    points = torch.rand((number, 3), generator=torch.Generator().manual_seed(0))
-    points[2] = torch.tensor(far)
-    assert (~plausible_points(points)).nonzero().tolist() == [[2]]
-
-
-@pytest.mark.hard_case("a sound cloud with a far background", "all points stay")
-def test_a_sound_cloud_with_a_far_background_is_plausible():
-    generator = torch.Generator().manual_seed(0)
-    near, background = (torch.randn((number, 3), generator=generator) for number in (1_000, 50))
-    assert plausible_points(torch.cat([near, 50 * background])).all()
-    assert plausible_points(torch.zeros((9, 3))).all()
-    assert plausible_points(torch.tensor([[0.0, 0, 0]] * 9 + [[5.0, 0, 0]])).all()  # most coincide
-    assert len(plausible_points(torch.zeros((0, 3)))) == 0

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.geometry import stereo
-from sadgs_ns.geometry.stereo import DepthMap, choose_neighbours, depth_maps
+from sadgs_ns.geometry.stereo import DepthMap, depth_maps
+from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 
 WIDTH, HEIGHT = 160, 120
 PLANES = {  # Normals n and offsets d of planes n · X = d. The nearest plane is seen.

@@ -16,7 +16,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.ops import Params
 from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render import step_memory as memory
+from sadgs_ns.render import step_memory
 from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.training.run.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.training.step.structure_cache import PIXELS_PER_BATCH
@@ -109,7 +109,7 @@ def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device
     share = FEW_IMAGES_SHARE
     if len(datamanager.train_dataset) > MANY_IMAGES:
         share = IMAGE_SHARE
-    device_free = least(memory.available_bytes(device)[0], device)
+    device_free = least(step_memory.available_bytes(device)[0], device)
     if size <= share * device_free:
         return ImageStorage(requested)
     reason = f"{needs}, and the GPU has {device_free / 1e9:.2g} GB free"
@@ -134,16 +134,16 @@ def fit_to_memory(
     """
     device = params["means"].device
     n = len(params["means"])
-    free, total = memory.available_bytes(device)
+    free, total = step_memory.available_bytes(device)
     if math.isinf(free):
         return cap, f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
     state = empty_state(0, device)
-    bytes_of_one = memory.kept_bytes(params, state) + memory.widest_bytes(params)
+    bytes_of_one = step_memory.kept_bytes(params, state) + step_memory.widest_bytes(params)
 
     def need(num_gaussians: int) -> float:
         """Return the bytes that a process with so many Gaussians needs at most."""
-        step = replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * num_gaussians)
-        working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, device).values())
+        step = replace(size.step, pairs=step_memory.PAIRS_PER_GAUSSIAN * size.step.views * num_gaussians)
+        working = max(size.structure_bytes, *step_memory.step_bytes(num_gaussians, step, device).values())
         return size.image_bytes + bytes_of_one * num_gaussians + working
 
     why = ""
@@ -156,7 +156,7 @@ def fit_to_memory(
             limit = f"memory_budget_gb is {budget_gb:g}"
         no_gaussians = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
-        rendered = memory.affordable_growth(no_gaussians, state, left, size.step)  # type: ignore[arg-type]
+        rendered = step_memory.affordable_growth(no_gaussians, state, left, size.step)
         affordable = processes * min(rendered, (left - size.structure_bytes) / bytes_of_one)
         if budget_gb is not None and affordable < 1:
             raise InputError(

@@ -17,7 +17,7 @@ from torch import Tensor
 from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.geometry.initialization import camera_extent
+from sadgs_ns.geometry.extents import camera_extent
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints
 from sadgs_ns.training.run.progress import note, warn

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from sadgs_ns.geometry.dense_start import NUMBER, dense_points
-from sadgs_ns.geometry.initialization import plausible_points
+from sadgs_ns.geometry.extents import plausible_points
 from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.quantization import dequantize
