@@ -37,7 +37,9 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     """
     pipeline.views.seed(config.machine.seed)
     resumed = Resumption.chosen_by(config)
-    before = None if resumed is None else resumed.plan
+    before = None
+    if resumed is not None:
+        before = resumed.plan
     near_plane = decide_near_plane(pipeline, before)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
     if resumed is None:
