@@ -152,14 +152,17 @@ class SadgsModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Return the callback that nerfstudio calls before a step.
 
-        After a step, the pipeline calls `step_post_backward`, because it has the step's infos.
+        After a step, the pipeline calls `densify` with the step's infos, and `finish_step`.
         """
         before_step, _ = super().get_training_callbacks(training_callback_attributes)
         return [before_step]
 
-    def step_post_backward(self, step: int, infos: Sequence[dict[str, Any]] = ()) -> None:
-        """Densify, prune haze and limit scales if that is due, and average the parameters at the run's end."""
+    def densify(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Split, clone and prune Gaussians if that is due after a step, given its `StepResult.infos`."""
         self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, infos)
+
+    def finish_step(self) -> None:
+        """Prune haze and limit scales if that is due, and average the parameters at the run's end."""
         iterations = self.plan.iterations
         done = self.step + 1
         # The number of iterations that are left before averaging begins; it is negative once they are averaged.

@@ -147,15 +147,16 @@ class SadgsPipeline(VanillaPipeline):
         return [
             TrainingCallback([step_end], lambda step: self._report_nonfinite_if_full()),
             *super().get_training_callbacks(training_callback_attributes),
-            TrainingCallback([step_end], self._densify),
+            TrainingCallback([step_end], lambda step: self._densify()),
             TrainingCallback([step_end, run_end], lambda step: self.structure.refresh()),
             TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True)),
         ]
 
-    def _densify(self, step: int) -> None:
-        """Let the model densify after a step, and drop the step's infos, which hold large tensors."""
-        self.model.step_post_backward(step, self._infos)
-        self._infos = []
+    def _densify(self) -> None:
+        """Let the model densify and do what else is due after a step."""
+        self.model.densify(self._infos)
+        self._infos = []  # They hold large tensors.
+        self.model.finish_step()
 
     def _report_nonfinite_if_full(self) -> None:
         if self.log.full:
@@ -249,8 +250,8 @@ class SadgsPipeline(VanillaPipeline):
             result.append(ViewGroup(indices, cameras, options, data, model.view_ids(indices), quantized))
         return result
 
-    def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
-        """Keep what later steps and reports need, without waiting for the device."""
+    def record_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
+        """Keep what densification, later steps and reports need, without waiting for the device."""
         self._infos = result.infos
         self._means_gradient = result.means_gradient
         self.log.record(step, [index for group in groups for index in group.indices], result.loss)
