@@ -98,9 +98,12 @@ def export(options: Export) -> int:
         load_open3d()  # It may be missing, which the user shall know before views are rendered.
     folders = _checkpoint_of(options.run).absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
-    from sadgs_ns.geometry.cleaning import Cleaning  # It imports torch.
+    # These import torch.
+    from sadgs_ns.geometry.cleaning import Cleaning
+    from sadgs_ns.viewer.cleaning_text import check_options
 
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
+    check_options(cleaning)
     similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
     params, drawing = read_checkpoint(options.run)
     if similarity is not None:
@@ -151,8 +154,9 @@ def _cleaned(
     from rich.console import Console
     from rich.progress import track
 
-    from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
+    from sadgs_ns.geometry.cleaning import Cleaning, choose_remaining, measure_visibility
     from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+    from sadgs_ns.viewer.cleaning_text import removal_sentences
 
     if cleaning == Cleaning():
         return params
@@ -166,8 +170,9 @@ def _cleaned(
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
         seen = measure_visibility(shapes, shown, drawing)
-    stays, sentences = find_remaining(shapes, cleaning, seen)
-    print("\n".join(sentences))
+    remaining = choose_remaining(shapes, cleaning, seen)
+    stays = remaining.stays
+    print("\n".join(removal_sentences(cleaning, remaining)))
     if not stays.any():
         problem = f"These options take away all {len(stays):,} Gaussians"
         raise InputError(f"{problem}: nothing is written, so take fewer away.")

@@ -10,7 +10,8 @@ from nerfstudio.viewer.viewer_elements import ViewerControl, ViewerDropdown, Vie
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.geometry.cleaning import Cleaning, Visibility, find_remaining, measure_visibility
+from sadgs_ns.geometry.cleaning import Cleaning, Visibility, choose_remaining, measure_visibility
+from sadgs_ns.viewer.cleaning_text import check_options, removal_sentences
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
 from sadgs_ns.viewer.shown_run import ShownRun
 
@@ -73,12 +74,14 @@ class CleaningPanel(torch.nn.Module):
         crop = None
         if (low, high) != (LOWEST_CORNER, HIGHEST_CORNER):
             crop = (*low, *high)
-        return Cleaning(
+        cleaning = Cleaning(
             min_views=int(self.min_views.value),
             max_extent=self.max_extent.value or None,  # The slider's 0 is no limit.
             crop=crop,
             dust=self.dust.value,
         )
+        check_options(cleaning)
+        return cleaning
 
     def _on_change(self, _: Any) -> None:
         """Refresh, and show any error in the panel; viser swallows exceptions of callbacks."""
@@ -99,9 +102,11 @@ class CleaningPanel(torch.nn.Module):
         if cleaning.needs_views:
             self._measure_visibility()
         params = dict(self._run.model.gauss_params.items())
-        stays, sentences = find_remaining(params, cleaning, self._visibility)
+        remaining = choose_remaining(params, cleaning, self._visibility)
+        stays = remaining.stays
         self._stays = stays
         self._shown = self.choice.value
+        sentences = removal_sentences(cleaning, remaining)
         sentences.append(f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay.")
         options = command_line_options(cleaning)
         if options:

@@ -14,10 +14,11 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
-from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
+from sadgs_ns.geometry.cleaning import Cleaning, choose_remaining, measure_visibility
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.viewer.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options
+from sadgs_ns.viewer.cleaning_text import removal_sentences
 
 
 @pytest.fixture
@@ -92,7 +93,8 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     assert [len(cameras) for cameras in looks] == [views]
     params = dict(model.gauss_params.items())
     seen = measure_visibility(params, looks[0], model.drawing)
-    _, sentences = find_remaining(params, Cleaning(min_views=3), seen)
+    cleaning = Cleaning(min_views=3)
+    sentences = removal_sentences(cleaning, choose_remaining(params, cleaning, seen))
     assert said.startswith(sentences[0])
     model.step += 1
     set_to(panel, dust=0.6)

@@ -1,4 +1,7 @@
-"""Checks of a data folder before nerfstudio parses it, in under a second for a few hundred images, without torch."""
+"""Checks of a data folder before nerfstudio parses it, in under a second for a few hundred images.
+
+They need no torch; only `capture`, the check with the settings of a run, imports nerfstudio.
+"""
 
 from __future__ import annotations
 

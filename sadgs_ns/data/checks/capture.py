@@ -47,7 +47,7 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
 class _CheckAhead:
     """A check at the start of a run, whose findings wait for the pipeline of the same run."""
 
-    config: FullImageDatamanagerConfig  # The settings that were checked
+    config: FullImageDatamanagerConfig  # The settings that were checked; the pipeline must be made of the same object
     settings: FullImageDatamanagerConfig  # A copy of them as they were then, which shows whether they have changed
     findings: list[Finding]
 
