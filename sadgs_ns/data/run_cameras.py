@@ -74,25 +74,25 @@ def _make_parser(settings: Mapping[str, Any], data: Path) -> Any:
 
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
     named = known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig())
-    config: Any = copy.deepcopy(named)
-    for field in fields(config):
+    parser: Any = copy.deepcopy(named)
+    for field in fields(parser):
         if field.name in settings and not field.name.startswith("_"):
-            setattr(config, field.name, settings[field.name])
-    config.data = data
-    manager = FullImageDatamanagerConfig(data=data, dataparser=config)
+            setattr(parser, field.name, settings[field.name])
+    parser.data = data
+    manager = FullImageDatamanagerConfig(data=data, dataparser=parser)
     choose_parser(manager)
-    config = manager.dataparser
-    config._target = OWN.get(config._target, config._target)
+    parser = manager.dataparser
+    parser._target = OWN.get(parser._target, parser._target)
     # Points are not needed. nerfstudio reads some with open3d, which a machine may lack, or asks whether to make a PLY.
-    if hasattr(config, "load_3D_points"):
-        config.load_3D_points = False
-    if hasattr(config, "ply_path"):
-        config.ply_path = None
-    parser = config.setup()
-    if isinstance(parser, ColmapDataParser):  # It asks whether to make smaller images, which are not needed either.
-        first = data / config.images_path / colmap.image_names(data / config.colmap_path)[0]
-        parser._downscale_factor = config.downscale_factor or automatic_factor(first)
-    return parser
+    if hasattr(parser, "load_3D_points"):
+        parser.load_3D_points = False
+    if hasattr(parser, "ply_path"):
+        parser.ply_path = None
+    made = parser.setup()
+    if isinstance(made, ColmapDataParser):  # It asks whether to make smaller images, which are not needed either.
+        first = data / parser.images_path / colmap.image_names(data / parser.colmap_path)[0]
+        made._downscale_factor = parser.downscale_factor or automatic_factor(first)
+    return made
 
 
 def _parse(settings: Mapping[str, Any], data: Path, may_be_other: bool) -> Any:

@@ -32,7 +32,7 @@ from helpers import forked_python
 from helpers.small_scenes import HEIGHT, POINTS, WIDTH
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-OTHER_LANGUAGES = {"python", "yaml", "{button-link}"}
+OTHER_LANGUAGES = {"python", "text", "yaml", "{button-link}"}
 """Of fenced blocks that hold no commands."""
 FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-install-cli")
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""

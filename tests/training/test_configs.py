@@ -173,7 +173,7 @@ def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
     methods = [m for name, m in vars(SplatfactoModel).items() if inspect.isfunction(m) and name not in overridden]
     used = [m for m in methods if m.__name__ not in ("_get_downscale_factor", "_downscale_if_required")]
     sources = ours + "".join(inspect.getsource(method) for method in used)
-    read = set(re.findall(r"(?:config|options\.model)\.(\w+)", sources))
+    read = {*re.findall(r"config\.(\w+)", sources), *re.findall(r"pipeline\.model\.(\w+)", sources)}
     options = {option.name for option in dataclasses.fields(SadgsModelConfig) if not option.name.startswith("_")}
     assert {name for name in read if name in vars(SplatfactoModelConfig())} <= options
     assert options <= read, "an option that nothing reads"
