@@ -79,10 +79,10 @@ class SadgsModelConfig(InstantiateConfig):
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
     stereo_points: int | None = None
-    """Points to start from beside the SfM points, at most, drawn from stereo depth of the training photos (CUDA).
-    None is 150,000 where there are 3 to 60 training views, and otherwise none."""
+    """Largest number of points that are drawn from stereo depth of the training photos and added to the start (CUDA).
+    None is 150,000 if there are 3 to 60 training views, and otherwise 0."""
     clear_paths: bool = True
-    """Prune what floats near the cameras' paths, again and again; viewers of files would show it as haze."""
+    """Prune Gaussians that float near the cameras' paths, again and again; viewers of files would show them as haze."""
     initial_opacity: float = POINT_OPACITY
     """Opacity at which SfM points start, in (0, 1); random ones start at 0.1."""
     sh_degree: int = 3
@@ -90,20 +90,20 @@ class SadgsModelConfig(InstantiateConfig):
     ssim_lambda: float = 0.6
     """Weight of SSIM against L1 in the loss, in [0, 1]. The paper's 0.2 resolves less detail for as many Gaussians."""
     opacity_reg: float = 0.01
-    """Weight of the mean opacity in the loss while densification runs: what no image needs fades until it is pruned.
-    Larger leaves fewer Gaussians; 0 is off, as in the paper."""
+    """Weight of the mean opacity in the loss while densification runs.
+    Gaussians that no image needs fade until they are pruned. Larger leaves fewer; 0 is off, as in the paper."""
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
-    The finished run has the mean; 0 leaves it the last iteration's."""
+    The finished run has the mean; with 0 it has the parameters of the last iteration."""
     max_off_axis: float = 4.0
     """Gaussians whose centre is projected farther than this from the image's centre, in half images, are not drawn.
     Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
     near_plane: float | None = None
     """Depth from which Gaussians are drawn, in training and later, in the run's units.
-    None is half the depth of the fifth nearest SfM point of a training camera, the smallest of all cameras."""
+    None is half the depth of a training camera's fifth nearest SfM point, for the camera where this is least."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
-    A longer one can cover a view beside which it lies with haze; 0 sets no limit."""
+    A longer one that lies beside a view can cover it with haze; 0 sets no limit."""
     color_model: Literal["none", "affine"] = "none"
     """Whether a colour matrix of each training photo is learned; held-out views are rendered without one."""
     color_corrected_metrics: bool = False
@@ -185,13 +185,13 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """The Gaussians and their densification."""
     effort: float = 1.0
     """How much training the capture gets, relative to what its number of views asks for.
-    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more where views are many."""
+    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more if there are many views."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
     memory_budget_gb: float | None = None
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
-    None is 80 % of what is free, unless `max_gaussians` was changed, which then stays."""
+    None is 80 % of the free memory. If `max_gaussians` was changed, None leaves it as it is."""
     frequency_constant: float = FREQUENCY_CONSTANT
     """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
     energy_blur: float = ENERGY_BLUR
@@ -218,6 +218,12 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
         self.model.check()
 
 
+def _default_device() -> Literal["cpu", "cuda"]:
+    if torch.cuda.is_available():
+        return "cuda"
+    return "cpu"
+
+
 @hide("num_machines", "machine_rank", "dist_url")
 @dataclass
 class SadgsMachineConfig(MachineConfig):
@@ -229,7 +235,7 @@ class SadgsMachineConfig(MachineConfig):
     """Number of CUDA devices of this machine to train on, among which the Gaussians are shared out.
     torchrun can start the processes instead, also on several machines; then this is 1."""
     device_type: Literal["cpu", "cuda"] = field(  # type: ignore[assignment]
-        default_factory=lambda: "cuda" if torch.cuda.is_available() else "cpu"
+        default_factory=_default_device
     )
     """Kind of device to train on; CUDA where there is one."""
 
@@ -270,13 +276,13 @@ class SadgsTrainerConfig(TrainerConfig):
     """Whether the host launches steps of few Gaussians at once, as CUDA graphs, instead of kernel by kernel.
     Only where there is CUDA, and up to a million Gaussians, counted in each view (docs/results.md)."""
     share_always: bool = False
-    """Share the Gaussians out over all devices, also where steps are so short that one device alone is quicker.
-    There, several devices help only if one does not hold the Gaussians."""
+    """Share the Gaussians out over all devices, even if steps are so short that one device is quicker.
+    Several devices then help only if one does not hold the Gaussians."""
     steps_per_save: int = 0
     """Steps between checkpoints; 0 leaves them to the clock. One is always made at the end."""
     seconds_per_save: float = 60.0
     """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
-    If 100 times what the last one took is longer, that is waited."""
+    The wait is at least 100 times as long as the last checkpoint took."""
     steps_per_eval_batch: Suppress[int] = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_all_images: int = 0
@@ -303,21 +309,19 @@ class SadgsTrainerConfig(TrainerConfig):
         """Raise InputError if `load_config` is no config.yml, or if options are given that nerfstudio then forgets."""
         if self.load_config is None:
             return
-        try:
-            with self.load_config.open(encoding="utf8") as file:
-                problem = None if file.readline().startswith("!!python/object:") else "it is no config.yml of a run"
-        except (OSError, UnicodeDecodeError) as error:
-            problem = reason(error)
-        if problem is not None:
+        problem = _problem_of_config_file(self.load_config)
+        if problem:
             raise InputError(f"{self.load_config} cannot be used ({problem}): give --load-config the file of a run.")
         from nerfstudio.configs.method_configs import all_methods  # It imports this module.
 
         preset = all_methods.get(self.method_name or "", self)
         given = {name for name, value in vars(preset).items() if vars(self)[name] != value}
-        if lost := sorted(given - {"load_config"}):
-            problem = f"With --load-config all options come from its file, and {', '.join(lost)} would be ignored"
-            remedy = "leave these out, change them in the file, or give --load-dir with the run's folder instead"
-            raise InputError(f"{problem}: {remedy}.")
+        ignored = sorted(given - {"load_config"})
+        if ignored:
+            raise InputError(
+                f"With --load-config all options come from its file, and {', '.join(ignored)} would be ignored: leave "
+                "these out, change them in the file, or give --load-dir with the run's folder instead."
+            )
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the values of a `config.yml` or a copy; options that an earlier version did not have get defaults."""
@@ -331,11 +335,14 @@ class SadgsTrainerConfig(TrainerConfig):
         """Raise InputError if training cannot work with these options, or if the device is not there."""
         length = self.max_num_iterations
         port = self.viewer.websocket_port
-        periods = [f"steps_per_{what}" for what in ("save", "eval_batch", "eval_image", "eval_all_images")]
         accumulated = any(steps != 1 for steps in self.gradient_accumulation_steps.values())
         ranges = [
             ("max_num_iterations", length is None or length >= 1, "at least 1"),
-            *((name, getattr(self, name) >= 0, "at least 0") for name in (*periods, "seconds_per_save")),
+            ("steps_per_save", self.steps_per_save >= 0, "at least 0"),
+            ("steps_per_eval_batch", self.steps_per_eval_batch >= 0, "at least 0"),
+            ("steps_per_eval_image", self.steps_per_eval_image >= 0, "at least 0"),
+            ("steps_per_eval_all_images", self.steps_per_eval_all_images >= 0, "at least 0"),
+            ("seconds_per_save", self.seconds_per_save >= 0, "at least 0"),
             ("mixed_precision", not self.mixed_precision, "False, since sadgs trains in float32"),
             ("use_grad_scaler", not self.use_grad_scaler, "False, since sadgs trains in float32"),
             ("log_gradients", not self.log_gradients, "False, since gradients are freed in each step"),
@@ -354,28 +361,30 @@ class SadgsTrainerConfig(TrainerConfig):
         """Raise InputError if a device is not there, or several cannot work with these options."""
         device = self.machine.device_type
         if device == "cuda" and not torch.cuda.is_available():
-            problem = "machine.device_type is cuda, but torch finds no CUDA device"
-            raise InputError(f"{problem}: set it to cpu, or install torch for CUDA.")
+            raise InputError(
+                "machine.device_type is cuda, but torch finds no CUDA device: set it to cpu, or install torch for CUDA."
+            )
         model = self.pipeline.model
         several = processes.check_devices(self.machine)
         if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
             choose_backend(model.backend, torch.device(device), not several)
         if not several:
             return
-        for name, given, remedy in (
+        options_of_one_device = [
             ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
             ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
             ("start_paused", self.start_paused, "leave it off, since the viewer is off, too"),
             (f"{SWITCH}=0", switched_off() and device == "cuda", "unset it"),
-        ):
-            if given:
+        ]
+        for name, is_set, remedy in options_of_one_device:
+            if is_set:
                 raise InputError(f"{name} works on one device only, and this run takes several: {remedy}.")
 
     def _check_rates(self) -> None:
         """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive."""
         for group, configs in self.optimizers.items():
             adam = configs["optimizer"]
-            rate = configs["optimizer"].lr
+            rate = adam.lr
             scheduler = configs.get("scheduler")
             ranges = [  # One launch updates all parameters.
                 ("_target", adam._target is FusedAdam, "sadgs's Adam"),
@@ -394,3 +403,15 @@ class SadgsTrainerConfig(TrainerConfig):
         """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""
         self.check()
         begin(self)
+
+
+def _problem_of_config_file(path: Path) -> str:
+    """Say why a file cannot be the `config.yml` of a run; "" if it can be one."""
+    try:
+        with path.open(encoding="utf8") as file:
+            first_line = file.readline()
+    except (OSError, UnicodeDecodeError) as error:
+        return reason(error)
+    if not first_line.startswith("!!python/object:"):
+        return "it is no config.yml of a run"
+    return ""

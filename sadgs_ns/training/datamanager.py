@@ -14,7 +14,6 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from rich.progress import track
-from torch import Tensor
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
@@ -31,10 +30,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         config = copy.copy(config)  # The original is written to config.yml.
         choose_parser(config)
         parser = copy.copy(config.dataparser)
-        if isinstance(parser, ColmapDataParserConfig):  # These checks precede the making of smaller images.
-            model = (config.data or parser.data) / parser.colmap_path
-            if (source := model / f"images.{colmap.model_kind(model)}").is_file():
-                splits.check_names((name for name, _, _ in colmap.read_poses(source)), source)
+        if isinstance(parser, ColmapDataParserConfig):
+            _check_names(config, parser)  # This precedes the making of smaller images.
         parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size.
@@ -57,23 +54,19 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
         """Load the images of a split on the device or on the host, or return `LazyImages` if they stay compressed."""
         device = torch.device(self.device)
-        dataset = self.train_dataset if split == "train" else self.eval_dataset
+        dataset = self.eval_dataset
+        if split == "train":
+            dataset = self.train_dataset
         images = LazyImages(dataset)
         self.train_cameras = self.train_dataset.cameras
         if cache_images_device == "compressed":
             return images
-
-        def place(tensor: Tensor) -> Tensor:
-            if cache_images_device == "gpu":
-                return tensor.to(device)
-            return tensor.pin_memory() if device.type == "cuda" else tensor
-
         loaded = []
         with ThreadPoolExecutor(thread_count(self.config.max_thread_workers)) as pool:
             decoded = pool.map(images.__getitem__, range(len(images)))
             try:
                 for data in track(decoded, f"Loading the {split} images", total=len(images), transient=True):
-                    loaded.append(data | {name: place(data[name]) for name in ("image", "mask") if name in data})
+                    loaded.append(_place(data, cache_images_device, device))
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
@@ -92,8 +85,32 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         return int(cameras.height[0]) * int(cameras.width[0])
 
 
+def _check_names(config: FullImageDatamanagerConfig, parser: ColmapDataParserConfig) -> None:
+    """Raise InputError if the names of a COLMAP model's images are wrong."""
+    model = (config.data or parser.data) / parser.colmap_path
+    source = model / f"images.{colmap.model_kind(model)}"
+    if source.is_file():
+        names = (name for name, _, _ in colmap.read_poses(source))
+        splits.check_names(names, source)
+
+
+def _place(data: dict[str, Any], where: str, device: torch.device) -> dict[str, Any]:
+    """Return an image's data with `image` and `mask` on the training device ("gpu"), or on the host for fast copies."""
+    placed = dict(data)
+    for name in ("image", "mask"):
+        if name not in data:
+            continue
+        if where == "gpu":
+            placed[name] = data[name].to(device)
+        elif device.type == "cuda":
+            placed[name] = data[name].pin_memory()
+    return placed
+
+
 @dataclass
 class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
+    """Camera [1] and data of each held-out view, which are copied to the device when they are read."""
+
     datamanager: SadgsDatamanager
 
     def __len__(self) -> int:
@@ -111,6 +128,8 @@ def _check_sizes(dataset: InputDataset) -> None:
     sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1)  # [C, 2] px
     for index in (sizes < 2).any(dim=-1).nonzero().flatten().tolist():
         width, height = sizes[index].tolist()
-        problem = f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px"
-        remedy = "scale it down less with pipeline.datamanager.camera-res-scale-factor or the parser's downscale-factor"
-        raise InputError(f"{problem}, and at least 2 × 2 are needed: take a larger image, or {remedy}.")
+        raise InputError(
+            f"{dataset.image_filenames[index]} would be trained on with {width} × {height} px, and at least 2 × 2 are "
+            "needed: take a larger image, or scale it down less with pipeline.datamanager.camera-res-scale-factor or "
+            "the parser's downscale-factor."
+        )

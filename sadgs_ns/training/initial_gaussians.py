@@ -20,34 +20,48 @@ from sadgs_ns.training.run.progress import warn
 def initial_gaussians(
     config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Return Gaussians of SfM points [P, 3], colours in 0 … 255, or random points, and which are synthetic [N]."""
+    """Return the parameters of N Gaussians at SfM or random points, and which of them are synthetic, bool [N].
+
+    `seed_points` are P SfM points [P, 3] and their colours in 0 … 255 [P, 3], if the data has some. Synthetic are all
+    Gaussians that stand for no SfM point. Their number is at most the cap; a warning says what is left out.
+    """
     if seed_points is None or config.random_init:
         if not config.random_init:
-            told = f"starting from {config.num_random} random ones in a cube of side {config.random_scale}"
-            warn(f"The data has no SfM points: {told}. A reconstruction (sadgs-process) gives a better splat.")
+            warn(
+                f"The data has no SfM points: starting from {config.num_random} random ones in a cube of side "
+                f"{config.random_scale}. A reconstruction (sadgs-process) gives a better splat."
+            )
         points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
         start = starting_points(points, torch.rand((len(points), 3)), faces=False)
-        sfm = 0
+        number_of_sfm_points = 0
     else:
-        points = seed_points[0].float()
-        colors = seed_points[1].float() / 255.0
-        plausible = plausible_points(points)  # [P]
-        if not plausible.all():
-            told = f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points"
-            warn(f"{told}, which are not finite or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.")
-            points = points[plausible]
-            colors = colors[plausible]
+        points, colors = _plausible(*seed_points)
         start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
-        sfm = len(points)
-    means = start[0]
+        number_of_sfm_points = len(points)
+    number = len(start[0])
     cap = config.strategy.max_gaussians
-    synthetic = torch.arange(len(means)) >= sfm
-    if len(means) > cap:
-        warn(f"Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.")
-        keep = torch.randperm(len(means))[:cap]
+    synthetic = torch.arange(number) >= number_of_sfm_points
+    if number > cap:
+        warn(f"Keeping a random {cap} of {number} initial points: max_gaussians is {cap}.")
+        keep = torch.randperm(number)[:cap]
         start = tuple(values[keep] for values in start)
         synthetic = synthetic[keep]
-    return spheres(*start, sh_degree=config.sh_degree), synthetic
+    means, colors, scales, opacities = start
+    return spheres(means, colors, scales, opacities, sh_degree=config.sh_degree), synthetic
+
+
+def _plausible(points: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the SfM points [P, 3] that are no outliers, and their colours [P, 3] in [0, 1] instead of 0 … 255."""
+    points = points.float()
+    colors = colors.float() / 255.0
+    plausible = plausible_points(points)  # [P]
+    if plausible.all():
+        return points, colors
+    warn(
+        f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points, which are not finite or more than "
+        f"{REACH:g} times as far out as {POINT_SHARE:.0%} of them."
+    )
+    return points[plausible], colors[plausible]
 
 
 def spheres(
@@ -60,11 +74,15 @@ def spheres(
 ) -> dict[str, Tensor]:
     """Return the parameters of spheres with random rotations."""
     number = len(means)
+    if sh_degree > 0:
+        features_dc = RGB2SH(colors)
+    else:
+        features_dc = torch.logit(colors, eps=1e-4)
     return {
         "means": means,
         "scales": scales.log()[:, None].repeat(1, 3),
         "quats": random_quat_tensor(number),
-        "features_dc": RGB2SH(colors) if sh_degree > 0 else torch.logit(colors, eps=1e-4),
+        "features_dc": features_dc,
         "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
         "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
     }

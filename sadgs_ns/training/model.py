@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict, replace
 from functools import cached_property
@@ -60,9 +61,10 @@ class SadgsModel(SplatfactoModel):
         config.check()
         self.strategy = config.strategy.for_run(DEFAULT_ITERATIONS)  # Until `follow` sets that of the run.
         self.strategy_state = self.strategy.initialize_state()
-        params, self.synthetic = initial_gaussians(config, self.seed_points)
-        """Tell which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]"""
-        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(p) for name, p in params.items()})
+        params, synthetic = initial_gaussians(config, self.seed_points)
+        # Which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]
+        self.synthetic = synthetic
+        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # A list keeps its weights out of the checkpoint.
@@ -101,11 +103,12 @@ class SadgsModel(SplatfactoModel):
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]
         means = means[:room]
+        colors = colors[:room]
         scales = scales[:room]
         spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [room]
         scales = torch.minimum(scales, spacing.to(scales))
         opacity = self.config.initial_opacity
-        added = spheres(means, colors[:room], scales, opacity, sh_degree=self.config.sh_degree)
+        added = spheres(means, colors, scales, opacity, sh_degree=self.config.sh_degree)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
         self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
@@ -116,11 +119,13 @@ class SadgsModel(SplatfactoModel):
 
         `near_plane` is the depth from which Gaussians will be drawn.
         """
-        if self.config.clear_paths:
-            surfaces = self.means.detach()[~self.synthetic.to(self.device)]
-            if self.seed_points is not None:  # From those near cameras no Gaussian starts.
-                surfaces = torch.cat([surfaces, self.seed_points[0].to(surfaces)])
-            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, near_plane, surfaces)
+        if not self.config.clear_paths:
+            return
+        surfaces = self.means.detach()[~self.synthetic.to(self.device)]
+        if self.seed_points is not None:
+            points, _ = self.seed_points  # No Gaussian starts from those near cameras, but they are on surfaces, too.
+            surfaces = torch.cat([surfaces, points.to(surfaces)])
+        self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, near_plane, surfaces)
 
     def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
@@ -134,7 +139,9 @@ class SadgsModel(SplatfactoModel):
     @property
     def num_gaussians(self) -> int:
         """Number of Gaussians of all processes."""
-        return self.num_points if self.world.alone else self.world.total
+        if self.world.alone:
+            return self.num_points
+        return self.world.total
 
     def follow(self, plan: RunPlan) -> None:
         """From now on, densify, average and draw according to a plan."""
@@ -146,16 +153,20 @@ class SadgsModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Return the callback that nerfstudio calls before a step.
 
-        After a step, the pipeline calls `step_post_backward`, because it has the step's infos.
+        After a step, the pipeline calls `densify` with the step's infos, and `finish_step`.
         """
         before_step, _ = super().get_training_callbacks(training_callback_attributes)
         return [before_step]
 
-    def step_post_backward(self, step: int, infos: Sequence[dict[str, Any]] = ()) -> None:
-        """Densify, prune haze and limit scales if that is due, and average the parameters at the run's end."""
+    def densify(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Split, clone and prune Gaussians if that is due after a step, given its `StepResult.infos`."""
         self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, infos)
+
+    def finish_step(self) -> None:
+        """Prune haze and limit scales if that is due, and average the parameters at the run's end."""
         iterations = self.plan.iterations
         done = self.step + 1
+        # The number of iterations that are left before averaging begins; it is negative once they are averaged.
         before_mean = iterations - round(self.config.averaged_share * iterations) - done
         if before_mean >= 0:
             self.average.clear()  # A run that is trained on may have begun to average earlier.
@@ -165,16 +176,21 @@ class SadgsModel(SplatfactoModel):
             self.average.add(self.gauss_params)
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
-        share = self.config.max_angular_scale
-        positions = self.camera_positions
-        if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
-            limit_scales(self.scales, self.means, positions, share)
+        if done % LIMIT_EVERY == 0 or done >= iterations:
+            self._limit_scales()
+
+    def _limit_scales(self) -> None:
+        """Shorten Gaussians that are longer than the option `max_angular_scale` allows, if it sets a limit."""
+        if self.config.max_angular_scale > 0 and self.camera_positions is not None:
+            limit_scales(self.scales, self.means, self.camera_positions, self.config.max_angular_scale)
 
     @property
     def trained_params(self) -> dict[str, Tensor]:
         """Parameters by name that a training step reads: the Gaussians', and colour matrices if there are some."""
-        learned = {} if self.color_matrices is None else {"color_matrices": self.color_matrices}
-        return {**dict(self.gauss_params.items()), **learned}
+        params: dict[str, Tensor] = dict(self.gauss_params.items())
+        if self.color_matrices is not None:
+            params["color_matrices"] = self.color_matrices
+        return params
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Return what is optimized, by the names of the optimizers."""
@@ -221,8 +237,10 @@ class SadgsModel(SplatfactoModel):
 
     def color_options(self, **changes: Any) -> RenderOptions:
         """Return the options to draw colours at this step, with other values of some fields."""
-        # Each iteration adds a degree; 3DGS's 1,000 iterations for each would be too many in so short a run.
-        degree = min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
+        degree = None
+        if self.config.sh_degree > 0:
+            # Each iteration adds a degree; 3DGS's 1,000 iterations for each would be too many in so short a run.
+            degree = min(self.step, self.config.sh_degree)
         return replace(self.drawing, sh_degree=degree, **changes)
 
     def render(
@@ -264,7 +282,9 @@ class SadgsModel(SplatfactoModel):
     @property
     def opacity_reg_now(self) -> float:
         """Factor on the mean opacity in this step's loss."""
-        return self.config.opacity_reg if self.step < self.strategy.windows.refine_stop_iter else 0.0
+        if self.step < self.strategy.windows.refine_stop_iter:
+            return self.config.opacity_reg
+        return 0.0
 
     def before_background(self, render: Tensor, alpha: Tensor, background: Tensor) -> Tensor:
         """Put renderings [C, H, W, ≥ 3] with their opacity [C, H, W, 1] on a background [3]. → [C, H, W, 3]"""
@@ -311,7 +331,8 @@ class SadgsModel(SplatfactoModel):
         They are 0.5 + 0.5 n with n of `normals_map`, in the world's axes, and black where nothing is.
         `params` default to the model's own inside the viewer's crop box.
         """
-        params = self.cropped(dict(self.gauss_params.items())) if params is None else params
+        if params is None:
+            params = self.cropped(dict(self.gauss_params.items()))
         pinhole = self.pinhole(camera)
         if not len(params["means"]):
             return torch.zeros((pinhole.height, pinhole.width, 3), device=self.device)
@@ -334,19 +355,26 @@ class SadgsModel(SplatfactoModel):
             warn_once(str(error))
             outputs = self.get_empty_outputs(int(camera.width), int(camera.height), self.background)
         if in_viewer():
-            return outputs if self.viewer_outputs is None else outputs | self.viewer_outputs(camera, outputs)
+            if self.viewer_outputs is not None:
+                outputs |= self.viewer_outputs(camera, outputs)
+            return outputs
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""
         image = image.to(self.device)
-        return image / 255.0 if image.dtype == torch.uint8 else image
+        if image.dtype == torch.uint8:
+            return image / 255.0
+        return image
 
     @cached_property
     def background(self) -> Tensor:
         """Colour behind the Gaussians; it is made once. [3]"""
-        return torch.full((3,), float(self.config.background_color == "white"), device=self.device)
+        brightness = 0.0
+        if self.config.background_color == "white":
+            brightness = 1.0
+        return torch.full((3,), brightness, device=self.device)
 
     def composite_with_background(self, image: Tensor, background: Tensor) -> Tensor:
         """Put images in [0, 1] [..., H, W, 3 or 4] on the background, [3] or [H, W, 3], if they have alpha."""
@@ -363,9 +391,11 @@ class SadgsModel(SplatfactoModel):
         self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Return the photometric loss of renderings, `rgb` […, H, W, 3]; training has its own (train_step.py)."""
-        pair = self.masked_pair(outputs["rgb"], batch, outputs["background"])
-        views = [image.reshape(-1, *image.shape[-3:]) for image in pair]
-        return {"main_loss": photometric_loss(views[0], views[1], ssim_lambda=self.config.ssim_lambda)[0]}
+        rgb, target = self.masked_pair(outputs["rgb"], batch, outputs["background"])
+        rgb = rgb.reshape(-1, *rgb.shape[-3:])  # [C, H, W, 3]
+        target = target.reshape(-1, *target.shape[-3:])
+        loss, _ = photometric_loss(rgb, target, ssim_lambda=self.config.ssim_lambda)
+        return {"main_loss": loss}
 
     def masked_pair(self, rgb: Tensor, batch: Mapping[str, Any], background: Tensor) -> tuple[Tensor, Tensor]:
         """Return a rendering and its photo […, H, W, 3] within the mask, on the same background, for the loss.
@@ -391,14 +421,19 @@ class SadgsModel(SplatfactoModel):
         if not self._lpips:
             self._lpips = [load_lpips(self.device)]
         metric = self._lpips[0]
-        return predicted.new_tensor(float("nan")) if metric is None else metric(predicted, target)
+        if metric is None:
+            return predicted.new_tensor(math.nan)
+        return metric(predicted, target)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        return {name: value for name, value in metrics.items() if "lpips" not in name or value == value}, images
+        for name in ("lpips", "cc_lpips"):
+            if name in metrics and math.isnan(metrics[name]):
+                del metrics[name]
+        return metrics, images
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state and the mean of the parameters so far."""
@@ -410,14 +445,20 @@ class SadgsModel(SplatfactoModel):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
-
-        def on_device(values: dict[str, Any]) -> dict[str, Any]:
-            return {key: v.to(self.device) if isinstance(v, Tensor) else v for key, v in values.items()}
-
-        self.strategy_state = on_device(state["strategy_state"])
-        if (paths := self.strategy_state.get("camera_paths")) is not None:
-            self.strategy_state["camera_paths"] = CameraPaths(**on_device(paths))
+        self.strategy_state = self._on_device(state["strategy_state"])
+        paths = self.strategy_state.get("camera_paths")
+        if paths is not None:
+            self.strategy_state["camera_paths"] = CameraPaths(**self._on_device(paths))
         self.average.load_state_dict(state["average"], self.device)
+
+    def _on_device(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a dictionary with its tensors on the model's device, and with all other values as they are."""
+        moved = {}
+        for name, value in values.items():
+            if isinstance(value, Tensor):
+                value = value.to(self.device)
+            moved[name] = value
+        return moved
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, into the parameters that optimizers may hold."""

@@ -31,9 +31,17 @@ def check_ranges(prefix: str, options: object, ranges: Iterable[tuple[str, bool,
     """
     for name, fits, allowed in ranges:
         if not fits:
-            value = getattr(options, name)
-            got = f"{value:g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
-            raise InputError(f"{prefix}{name} must be {allowed}, got {got}.")
+            value = _shown(getattr(options, name))
+            raise InputError(f"{prefix}{name} must be {allowed}, got {value}.")
+
+
+def _shown(value: object) -> str:
+    """Return an option's value as a sentence shows it."""
+    if isinstance(value, float):
+        return f"{value:g}"
+    if type(value) is int:  # True and False are no numbers here.
+        return f"{value:,}"
+    return str(value)
 
 
 def fill_missing(options: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import asdict
 from functools import partial
@@ -50,26 +51,17 @@ class SadgsPipeline(VanillaPipeline):
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         config.check()
-        # Rendering new views ("inference") opens no image.
-        for finding in findings_of(config.datamanager, open_images=kwargs.get("test_mode") != "inference"):
+        opens_images = kwargs.get("test_mode") != "inference"  # This mode is for rendering new views.
+        for finding in findings_of(config.datamanager, open_images=opens_images):
             if finding.severity == "warning":
                 warn(finding.sentence)
         super().__init__(config, *args, **kwargs)
-        backend = self.model.backend  # raises InputError if it cannot work
+        backend = self.model.backend  # This raises InputError if it cannot work.
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
-        loads_images = config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference"
-        if loads_images:
-            storage = choose_image_storage(self.datamanager, self.device)
-            self.datamanager.config.cache_images = storage.where  # type: ignore[assignment]
-            if storage.sentence:
-                note(storage.sentence)
-        parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
-        if parsed_on is not None and parsed_on != config.model.background_color:
-            warn(
-                f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: consider "
-                f"--pipeline.model.background-color {parsed_on}."
-            )
+        if opens_images and config.datamanager.cache_images != "compressed":
+            self._store_images()
+        self._warn_of_other_background()
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
         self.model.set_cameras(self.datamanager.train_dataset.cameras)
@@ -85,7 +77,7 @@ class SadgsPipeline(VanillaPipeline):
         self.log = NonFiniteLog(self.device)
         self._infos: list[dict[str, Any]] = []  # The rasterizer's, of the last step until densification has read them
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
-        self.diverged = ""  # a sentence with the reason once nothing is learned any more
+        self.diverged = ""  # A sentence with the reason once nothing is learned any more
         shown_run = ShownRun(
             model=self.model,
             datamanager=self.datamanager,
@@ -98,6 +90,23 @@ class SadgsPipeline(VanillaPipeline):
         self.cleaning = CleaningPanel(shown_run)
         self.model.viewer_outputs = self._viewer_outputs
 
+    def _store_images(self) -> None:
+        """Keep the images where the memory has room for them, and print it if that is not where the options say."""
+        storage = choose_image_storage(self.datamanager, self.device)
+        self.datamanager.config.cache_images = storage.where  # type: ignore[assignment]
+        if storage.sentence:
+            note(storage.sentence)
+
+    def _warn_of_other_background(self) -> None:
+        """Print a warning if the parser puts transparent images on another background than the Gaussians'."""
+        behind_images = getattr(self.datamanager.dataparser.config, "alpha_color", None)
+        behind_gaussians = self.config.model.background_color
+        if behind_images is not None and behind_images != behind_gaussians:
+            warn(
+                f"The images were put on {behind_images}, the Gaussians lie on {behind_gaussians}: consider "
+                f"--pipeline.model.background-color {behind_images}."
+            )
+
     def _view_cameras(self) -> list[Pinholes]:
         """Return the camera of each training view, with the pose that is learned so far."""
         _, Ks = self.views.cameras
@@ -109,9 +118,12 @@ class SadgsPipeline(VanillaPipeline):
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the panels' pictures and normals, which cannot be lazy while training changes the Gaussians."""
-        shown = shows_output(self.structure.viewer, NORMALS)
-        normals = {NORMALS: self.model.get_normals(camera) if shown else rendered["rgb"]}
-        return normals | self.structure.outputs(camera, rendered) | self.cleaning.outputs(camera, rendered)
+        outputs = {NORMALS: rendered["rgb"]}
+        if shows_output(self.structure.viewer, NORMALS):
+            outputs[NORMALS] = self.model.get_normals(camera)
+        outputs |= self.structure.outputs(camera, rendered)
+        outputs |= self.cleaning.outputs(camera, rendered)
+        return outputs
 
     def follow(self, plan: RunPlan) -> None:
         """From now on, train and draw according to a plan."""
@@ -135,15 +147,16 @@ class SadgsPipeline(VanillaPipeline):
         return [
             TrainingCallback([step_end], lambda step: self._report_nonfinite_if_full()),
             *super().get_training_callbacks(training_callback_attributes),
-            TrainingCallback([step_end], self._densify),
+            TrainingCallback([step_end], lambda step: self._densify()),
             TrainingCallback([step_end, run_end], lambda step: self.structure.refresh()),
             TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True)),
         ]
 
-    def _densify(self, step: int) -> None:
-        """Let the model densify after a step, and drop the step's infos, which hold large tensors."""
-        self.model.step_post_backward(step, self._infos)
-        self._infos = []
+    def _densify(self) -> None:
+        """Let the model densify and do what else is due after a step."""
+        self.model.densify(self._infos)
+        self._infos = []  # They hold large tensors.
+        self.model.finish_step()
 
     def _report_nonfinite_if_full(self) -> None:
         if self.log.full:
@@ -156,10 +169,9 @@ class SadgsPipeline(VanillaPipeline):
 
     def check_visibility(self, near_plane: float) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
-        cameras = self.datamanager.train_dataset.cameras
-        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
-        means = self.model.means.detach()
-        means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
+        poses = self.datamanager.train_dataset.cameras.camera_to_worlds  # [C, 3, 4]
+        viewmats = viewmats_from_camera_to_world(_sample(poses))
+        means = _sample(self.model.means.detach()).to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
         drawn = ((depths > near_plane) & (depths < FAR_PLANE)).any(dim=1)
         world = self.model.world
@@ -191,13 +203,23 @@ class SadgsPipeline(VanillaPipeline):
         lasts = bool(problems) and self.log.streak >= enough
         gradient = self._means_gradient
         if self.model.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
-            step, _, problem = problems[-1]
-            names = [files[view].name for view in dict.fromkeys(view for _, views, _ in problems for view in views)]
-            more = f" and {len(names) - _NAMED_STEPS} more" if len(names) > _NAMED_STEPS else ""
-            self.diverged = (
-                f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {step + 1}: {problem} "
-                f"(images {', '.join(names[:_NAMED_STEPS])}{more})"
-            )
+            self.diverged = self._describe_divergence(problems)
+
+    def _describe_divergence(self, problems: list[tuple[int, list[int], str]]) -> str:
+        """Say since when nothing is learned, why and in which images, given the steps that were not finite."""
+        last_step, _, problem = problems[-1]
+        files = self.datamanager.train_dataset.image_filenames
+        names: dict[int, str] = {}  # By views, so that each is named once
+        for _, views, _ in problems:
+            for view in views:
+                names[view] = files[view].name
+        images = ", ".join(list(names.values())[:_NAMED_STEPS])
+        if len(names) > _NAMED_STEPS:
+            images += f" and {len(names) - _NAMED_STEPS} more"
+        return (
+            f"Nothing was learned in the last {self.log.streak} iterations, up to iteration {last_step + 1}: {problem} "
+            f"(images {images})"
+        )
 
     def _repeat_overflowed(self, *, wait: bool = False) -> None:
         """Requeue the views that were not drawn because their tile lists were longer than foreseen."""
@@ -228,8 +250,8 @@ class SadgsPipeline(VanillaPipeline):
             result.append(ViewGroup(indices, cameras, options, data, model.view_ids(indices), quantized))
         return result
 
-    def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
-        """Keep what later steps and reports need, without waiting for the device."""
+    def record_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
+        """Keep what densification, later steps and reports need, without waiting for the device."""
         self._infos = result.infos
         self._means_gradient = result.means_gradient
         self.log.record(step, [index for group in groups for index in group.indices], result.loss)
@@ -246,8 +268,10 @@ class SadgsPipeline(VanillaPipeline):
         """Return the mean, and for several views the deviation, of each metric; raise InputError without views."""
         views = len(self.datamanager.eval_dataset)
         if views == 0:
-            problem = "The run holds out no view, so that there is nothing to measure"
-            raise InputError(f"{problem}: train with one of the parser's --eval-mode that holds out some.")
+            raise InputError(
+                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
+                "--eval-mode that holds out some."
+            )
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
@@ -300,3 +324,9 @@ class SadgsPipeline(VanillaPipeline):
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def _sample(rows: Tensor) -> Tensor:
+    """Return up to `_SAMPLED` rows of a tensor, at equal distances. [N, …] → [n, …]"""
+    every = math.ceil(len(rows) / _SAMPLED)
+    return rows[::every]

@@ -35,7 +35,9 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
     for name, (lr, initial_factor, final_factor) in (RATES | rates).items():
         groups[name] = {"optimizer": FusedAdamOptimizerConfig(lr=lr)}
         if (initial_factor, final_factor) != (1.0, 1.0):
-            hold = DENSIFICATION_SHARE if name in HELD else 0.0
+            hold = 0.0
+            if name in HELD:
+                hold = DENSIFICATION_SHARE
             groups[name]["scheduler"] = RunLengthDecaySchedulerConfig(
                 initial_factor=initial_factor, final_factor=final_factor, hold_share=hold
             )
@@ -83,10 +85,11 @@ sadgs = MethodSpecification(
 
 def paper_method(name: str, where: str, views: int, **rates: tuple[float, float, float]) -> MethodSpecification:
     """Return a preset of the paper, with these rates of scales and rotations."""
+    views_in_words = {1: "one view", 2: "two views"}[views]
     return MethodSpecification(
         description=(
             f"Structure-aware densification with the paper's loss and children, {where} scenes; 3,000 iterations of "
-            f"{'one view' if views == 1 else 'two views'}."
+            f"{views_in_words}."
         ),
         config=SadgsTrainerConfig(
             method_name=name,

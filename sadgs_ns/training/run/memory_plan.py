@@ -28,7 +28,7 @@ MANY_IMAGES = 500  # Up to this many training images nerfstudio would keep on th
 IMAGE_SHARE = 0.25  # Largest share of the device's free memory for the images if there are more than `MANY_IMAGES`
 FEW_IMAGES_SHARE = 0.5  # The same if there are no more
 HOST_SHARE = 0.5
-"""Largest share of the host's free memory for decoded images, of which torch rounds pinned ones up to powers of two."""
+"""Largest share of the host's free memory for decoded images. torch rounds a pinned image up to a power of two."""
 
 
 @dataclass(frozen=True)

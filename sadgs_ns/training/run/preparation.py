@@ -32,12 +32,14 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     """Bring the pipeline to where a run begins or goes on, and plan the run; call before optimizers are made.
 
     `config` is the trainer's own: its `vis` is changed if several processes train, because these have no viewer.
-    If one process trains more quickly alone, the others exit here. Raises InputError if the options, the checkpoint,
-    the data and the machine do not fit each other.
+    If one process would train more quickly than all, the others exit here. Raises InputError if the options, the
+    checkpoint, the data and the machine do not fit each other.
     """
     pipeline.views.seed(config.machine.seed)
     resumed = Resumption.chosen_by(config)
-    before = None if resumed is None else resumed.plan
+    before = None
+    if resumed is not None:
+        before = resumed.plan
     near_plane = decide_near_plane(pipeline, before)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
     if resumed is None:

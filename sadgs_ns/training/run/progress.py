@@ -21,9 +21,11 @@ from sadgs_ns.events import report
 
 COLUMNS = {"Step (% Done)": 18, "Loss": 9, "PSNR": 10, "Gaussians": 12, "Iteration": 11, "Time left": 10}
 """Columns of the table and their widths, which fit a terminal of 80 characters."""
-ITERATION_SHARES, TIME_SHARES = (0.0, 0.2, 0.533, 0.75, 1.0), (0.0, 0.15, 0.668, 0.817, 1.0)
+ITERATION_SHARES = (0.0, 0.2, 0.533, 0.75, 1.0)
+TIME_SHARES = (0.0, 0.15, 0.668, 0.817, 1.0)
 """Shares of a run's iterations, and of its time that they take: they are longest while the most Gaussians are there."""
-_MEASURED_SHARE = 0.35  # Share of a run's time after which the time left is told; sooner it would be over 30 % off.
+_DENSIFICATION_END = ITERATION_SHARES[2]  # Share of a run's iterations after which densification is over
+_MEASURED_SHARE = 0.35  # Share of a run's time after which the time left is shown; sooner it would be over 30 % off.
 
 
 def note(text: str) -> None:
@@ -40,34 +42,45 @@ def warn(text: str) -> None:
 
 def duration(seconds: float) -> str:
     """Return a time as "40 s", "12 min" or "3 h 5 min"."""
-    minutes = round(seconds / 60)
     if seconds < 99.5:
         return f"{seconds:.0f} s"
-    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
+    minutes = round(seconds / 60)
+    if minutes < 100:
+        return f"{minutes} min"
+    return f"{minutes // 60} h {minutes % 60} min"
 
 
 def time_left(first: int, step: int, total: int, seconds: float, recent: int = 0, pace: float = 0.0) -> float | None:
-    """Return the seconds that a run of `total` iterations has left if those after `first` until `step` took `seconds`.
+    """Return the seconds that a run of `total` iterations has left; None if it is too early to tell.
 
-    Those after `recent` took `pace` each, as all do after densification. None is too early to tell. It was within 30 %
-    on eight captures, on two hosts each, and then within 20 (docs/results.md).
+    The iterations after `first` until `step` took `seconds` in all, and those after `recent` took `pace` seconds each.
+    The estimate was within 30 % on eight captures, on two hosts each, and later within 20 % (docs/results.md).
     """
-    if recent > ITERATION_SHARES[2] * total:
+    if recent > _DENSIFICATION_END * total:  # From there on, all iterations take about the same time.
         return pace * (total - 1 - step)
     before, done = np.interp([(first + 1) / total, (step + 1) / total], ITERATION_SHARES, TIME_SHARES)
-    return None if done - before < _MEASURED_SHARE else float(seconds * (1 - done) / (done - before))
+    measured = done - before
+    if measured < _MEASURED_SHARE:
+        return None
+    return float(seconds * (1 - done) / measured)
 
 
 def cpu_notice(threads: int) -> str:
     """Return what a user should know who trains without a GPU, with so many threads of torch."""
     text = "This run trains on the CPU, which is for small scenes and tests: a GPU is about a hundred times as fast."
-    remedy = "beside other work one is quicker: put OMP_NUM_THREADS=1 before the command."
-    return text if threads == 1 else f"{text} It computes with {threads} threads; {remedy}"
+    if threads == 1:
+        return text
+    return (
+        f"{text} It computes with {threads} threads; beside other work one is quicker: put OMP_NUM_THREADS=1 before "
+        "the command."
+    )
 
 
 def next_commands(config: Path, gaussians: int) -> str:
     """Return the commands for a finished run, from the path of its `config.yml` and its number of Gaussians."""
-    file, metrics, splat = (shlex.quote(str(config.with_name(n))) for n in (config.name, "eval.json", "splat.ply"))
+    file = shlex.quote(str(config))
+    metrics = shlex.quote(str(config.with_name("eval.json")))
+    splat = shlex.quote(str(config.with_name("splat.ply")))
     return (
         f"What can be done with these {gaussians:,} Gaussians:\n"
         f"  ns-viewer --load-config {file}\n"
@@ -90,10 +103,11 @@ class ProgressTable(LocalWriter):
         super().__init__(config, banner_messages)
         self._banner = banner_messages or []
         self._rows: deque[str] = deque(maxlen=config.max_log_size or None)
-        self._times: deque[tuple[int, float]] = deque(maxlen=10)
-        self._first: tuple[int, float] | None = None  # the first row
-        in_place = config.max_log_size > 0 and CONSOLE.is_interactive
-        self._live = Live(console=CONSOLE, auto_refresh=False) if in_place else None
+        self._times: deque[tuple[int, float]] = deque(maxlen=10)  # Steps of the last rows, and when they were added
+        self._first: tuple[int, float] | None = None  # Those of the first row
+        self._live: Live | None = None
+        if config.max_log_size > 0 and CONSOLE.is_interactive:
+            self._live = Live(console=CONSOLE, auto_refresh=False)
 
     def write_stats_log(self, step: int) -> None:
         """Add a row if the step is due for one; nerfstudio calls this after every step, and once after the last."""
@@ -104,23 +118,37 @@ class ProgressTable(LocalWriter):
         if step % writer.GLOBAL_BUFFER["steps_per_log"] != 0:
             return
         cells = _cells(events)  # On CUDA this waits for the step.
-        now = time.monotonic()
-        self._times.append((step, now))
-        self._first = self._first or self._times[0]
         total = writer.GLOBAL_BUFFER["max_iter"]
-        timing = ["", ""]
-        if step > self._times[0][0]:
-            pace = (now - self._times[0][1]) / (step - self._times[0][0])
-            left = time_left(self._first[0], step, total, now - self._first[1], self._times[0][0], pace)
-            short = f"{1000 * pace:.0f} ms" if pace < 1 else f"{pace:.1f} s"
-            timing = [short, "" if left is None else duration(left)]
-        report("iteration", step=step, left=timing[1])
-        self._show(_line([f"{step} ({step / total:.2%})", *cells, *timing]))
+        pace, left = self._timing(step, total, time.monotonic())
+        report("iteration", step=step, left=left)
+        self._show(_line([f"{step} ({step / total:.2%})", *cells, pace, left]))
+
+    def _timing(self, step: int, total: int, now: float) -> tuple[str, str]:
+        """Add the time of a row, and return the time of an iteration and the time left, each "" if it is not known."""
+        self._times.append((step, now))
+        if self._first is None:
+            self._first = self._times[0]
+        first_step, first_time = self._first
+        recent_step, recent_time = self._times[0]
+        if step <= recent_step:
+            return "", ""
+        pace = (now - recent_time) / (step - recent_step)
+        if pace < 1:
+            shown_pace = f"{1000 * pace:.0f} ms"
+        else:
+            shown_pace = f"{pace:.1f} s"
+        left = time_left(first_step, step, total, now - first_time, recent_step, pace)
+        if left is None:
+            return shown_pace, ""
+        return shown_pace, duration(left)
 
     def _show(self, row: str) -> None:
+        """Print a row, or put it below the others in place."""
         header = [_line(list(COLUMNS)), "-" * sum(COLUMNS.values())]
         if self._live is None:
-            lines = [row] if self.has_printed else [*self._banner, *header, row]
+            lines = [row]
+            if not self.has_printed:
+                lines = [*self._banner, *header, row]
             CONSOLE.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
         else:
             self._rows.append(row)
@@ -137,20 +165,29 @@ class ProgressTable(LocalWriter):
 def _cells(events: dict[str, Any]) -> list[str]:
     """Return loss, PSNR and number of Gaussians, each "" if nerfstudio did not hand it over."""
     metrics = events.get("Train Metrics Dict", {})
-    values = {
-        "{:.4f}": events.get("Train Loss"),
-        "{:.2f} dB": metrics.get("psnr"),
-        "{:,.0f}": metrics.get("gaussian_count"),
-    }
-    return ["" if v is None else form.format(float(torch.as_tensor(v).detach())) for form, v in values.items()]
+    return [
+        _cell("{:.4f}", events.get("Train Loss")),
+        _cell("{:.2f} dB", metrics.get("psnr")),
+        _cell("{:,.0f}", metrics.get("gaussian_count")),
+    ]
+
+
+def _cell(form: str, value: Any) -> str:
+    """Return a number or tensor in a format; "" if it is None."""
+    if value is None:
+        return ""
+    return form.format(float(torch.as_tensor(value).detach()))
 
 
 def _line(cells: list[str]) -> str:
-    return "".join(f"{cell:<{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True)).rstrip()
+    """Return a row of the table, whose cells are as wide as `COLUMNS`."""
+    padded = [f"{cell:<{width}}" for cell, width in zip(cells, COLUMNS.values(), strict=True)]
+    return "".join(padded).rstrip()
 
 
 def remove_tables() -> None:
     """Remove the tables of finished runs from nerfstudio's list, and give the terminal back."""
-    for table in [table for table in writer.EVENT_WRITERS if isinstance(table, ProgressTable)]:
+    tables = [table for table in writer.EVENT_WRITERS if isinstance(table, ProgressTable)]
+    for table in tables:
         table.stop()
         writer.EVENT_WRITERS.remove(table)

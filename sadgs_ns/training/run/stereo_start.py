@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
+from torch import Tensor
 
 from sadgs_ns.geometry.dense_start import NUMBER, dense_points
 from sadgs_ns.geometry.extents import plausible_points
@@ -13,13 +17,17 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.progress import note
 
-FEWEST_VIEWS, MOST_VIEWS = 3, 60
+FEWEST_VIEWS = 3
+MOST_VIEWS = 60
 """Numbers of training views with which a run starts from stereo depth by default. With more views it brought no PSNR
 and little else, for one to two seconds (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
-    """Return how many points of stereo depth a run may start from; print a line if CUDA is missing for them."""
+    """Return how many points of stereo depth a run may start from, and print a sentence if they need CUDA.
+
+    0 if the run starts from no such points.
+    """
     model = pipeline.model
     views = len(pipeline.datamanager.train_dataset)
     requested = model.config.stereo_points
@@ -41,31 +49,44 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     It loads the images. Returns whether the run starts, or started, from such points.
     """
     number = number_of_points(pipeline)
-    if not number or resumed:
-        return number > 0
+    if number == 0:
+        return False
+    if resumed:
+        return True
     model = pipeline.model
     cache = pipeline.structure_cache
-    cached = pipeline.datamanager.cached_train  # Undistorting images changes cameras.
+    images = pipeline.datamanager.cached_train  # Undistorting images changes the cameras, so this comes first.
     # Frames of a video that lie far apart tell more about depth.
-    chosen = torch.linspace(0, len(cached) - 1, min(len(cached), MOST_VIEWS)).round().long()
+    chosen = torch.linspace(0, len(images) - 1, min(len(images), MOST_VIEWS)).round().long()
     cameras = pipeline.datamanager.train_dataset.cameras[chosen]
-    views = chosen.tolist()
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-    assert model.seed_points is not None
-    points = model.seed_points[0]
     Ks = cameras.get_intrinsics_matrices()
+    views = chosen.tolist()
+    assert model.seed_points is not None
+    points, _ = model.seed_points
     points = points[plausible_points(points)].to(model.device)
+    masks = [_mask_of(images[view]) for view in views]
+
     # Images that stay compressed are decoded at each access: the host may have no room for all of them.
-    masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in (cached[view] for view in views)]
-    depths = depth_maps(lambda i: cached[views[i]]["image"], viewmats, Ks, points, masks=masks, device=model.device)
-    starts = dense_points(
-        depths,
-        viewmats,
-        lambda i: cache.photo(cached[views[i]])[..., :3],
-        lambda i: wavelength(dequantize(cache[views[i]])),
-        number,
-    )
-    added = model.add_points(*starts)
-    known = sum(float((d.confidence > 0).float().mean()) for d in depths) / len(depths)
+    def image_of(place: int) -> Tensor:
+        return images[views[place]]["image"]
+
+    def photo_of(place: int) -> Tensor:
+        return cache.photo(images[views[place]])[..., :3]
+
+    def wavelength_of(place: int) -> Tensor:
+        return wavelength(dequantize(cache[views[place]]))
+
+    depths = depth_maps(image_of, viewmats, Ks, points, masks=masks, device=model.device)
+    means, colors, scales = dense_points(depths, viewmats, photo_of, wavelength_of, number)
+    added = model.add_points(means, colors, scales)
+    known = sum(float((depth.confidence > 0).float().mean()) for depth in depths) / len(depths)
     note(f"The start has {added:,} points of stereo depth, known in {known:.0%} of the pixels, beside the SfM points.")
     return True
+
+
+def _mask_of(data: Mapping[str, Any]) -> Tensor | None:
+    """Return the mask of a datamanager's image, bool [H, W]; None if it has none."""
+    if "mask" not in data:
+        return None
+    return data["mask"][..., 0].bool()

@@ -215,7 +215,7 @@ class SadgsTrainer(Trainer):
             model.tile_forecast.round_to_powers = self.graphed.prepare(model.plan.views_per_iteration)
         groups = self.pipeline.next_views(step)
         result = self._train_on(groups)
-        self.pipeline.finish_step(step, groups, result)
+        self.pipeline.record_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
         metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}
         model.camera_optimizer.get_metrics_dict(metrics)

@@ -44,9 +44,14 @@ class ViewGroup:
             rows = slice(band.top, band.bottom)
             data = self.data[band.view]
             return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
-        batch = {"image": stack([data["image"] for data in self.data]) if self.images is None else self.images}
+        images = self.images
+        if images is None:
+            images = stack([data["image"] for data in self.data])
+        batch = {"image": images}
         masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
-        return batch if masks is None else batch | {"mask": masks}
+        if masks is not None:
+            batch["mask"] = masks
+        return batch
 
 
 @dataclass(frozen=True)
