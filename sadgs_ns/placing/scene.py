@@ -126,7 +126,9 @@ class Scene:
 
     def _changed_options(self, begun: SceneSettings) -> list[str]:
         """Return the options that differ, as parts of a sentence."""
-        options = [("--camera-per-photo", begun.camera_per_photo, self.settings.camera_per_photo)]
+        options: list[tuple[str, Any, Any]] = [
+            ("--camera-per-photo", begun.camera_per_photo, self.settings.camera_per_photo)
+        ]
         if self.is_video:
             options.append(("--frames", begun.frames, self.settings.frames))
         if self.finished:
