@@ -43,6 +43,8 @@ COMMANDS = {
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
     "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
+    "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
+    "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
 }
 """What is done besides running a protocol, and the class that does it."""

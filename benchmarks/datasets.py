@@ -56,7 +56,7 @@ def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
     """
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-    from sadgs_ns.data.checks.images import MAX_AUTO_RESOLUTION, image_size, smaller_folder
+    from sadgs_ns.data.images import MAX_AUTO_RESOLUTION, image_size, smaller_folder
 
     model, images = data / parser.colmap_path, data / parser.images_path
     if (model / "cameras.txt").exists():  # nerfstudio's order of preference

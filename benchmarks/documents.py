@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from tyro.conf import Positional
 
-from benchmarks import table
+from benchmarks import chain_table, table
 from benchmarks.table import Change, Run
 from sadgs_ns.files import atomic_path
 
@@ -98,6 +98,10 @@ class Source:
         """What `approximations` measured in an image, of some variants or of all."""
         found = {r["variant"]: r for r in self.read(rows) if (r["table"], r["input"]) == (of, input)}
         return table.of_approximations([found[name] for name in variants or found])
+
+    def chain(self, rows: str, labels: Mapping[str, str]) -> str:
+        """What `benchmarks.chain` measured, a line for each capture and label."""
+        return chain_table.markdown(self.read(rows), labels)
 
     def peers_drawn(self, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()) -> list[Any]:
         """Arguments of `plots.peers`."""

@@ -9,6 +9,7 @@ LPIPS is torchmetrics' with AlexNet, which sees the images stretched to [-1, 1],
 
 from __future__ import annotations
 
+import dataclasses
 import statistics
 import time
 from collections.abc import Iterable
@@ -98,13 +99,13 @@ def quality(
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
     """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
 
-    `view_psnr`, which `quality` measured, is returned unless the model has a `near_plane` that lies beyond theirs.
+    `view_psnr`, which `quality` measured, is returned unless the model's plan has a near plane beyond theirs.
     """
-    near_plane = getattr(model, "near_plane", 0.0)
-    if near_plane <= NEAR_PLANE:
+    plan = getattr(model, "plan", None)  # Models of other methods have none.
+    if plan is None or plan.near_plane <= NEAR_PLANE:
         return view_psnr
-    model.near_plane = NEAR_PLANE
+    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE)
     try:
         return quality(model, views)["view_psnr"]
     finally:
-        model.near_plane = near_plane
+        model.plan = plan

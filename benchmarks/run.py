@@ -29,6 +29,8 @@ from benchmarks.protocol import Job, Row, Scene, set_dotted
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
+    from benchmarks.curve import Curve, LoopTimer
+
 
 def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> TrainerConfig:
     """The nerfstudio config of a run on a scene below `root`, which writes to `work`.
@@ -108,33 +110,52 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
 
     Raises as `build_config`, RuntimeError if the training loop stopped early, or whatever the method raises.
     """
-    seconds: dict[str, float] = {}
     start = time.perf_counter()
-    import torch
-
     # ns-train's own module: importing it also sets cuDNN as in a user's run.
-    from nerfstudio.scripts.train import _set_random_seed
+    import nerfstudio.scripts.train  # noqa: F401
 
-    from benchmarks import evaluate
-    from benchmarks.curve import Curve, LoopTimer, point
+    from benchmarks.curve import point
     from sadgs_ns.training.run import processes
 
     devices = processes.number_of_processes()
-    seconds["import_seconds"] = time.perf_counter() - start
+    seconds = {"import_seconds": time.perf_counter() - start}
 
-    @contextlib.contextmanager
-    def timed(name: str) -> Iterator[None]:
-        begin = evaluate.now()
-        yield
-        seconds[f"{name}_seconds"] = evaluate.now() - begin
+    trainer, timer, curve = train(job, root, work, devices, seconds)
+    if devices > 1:
+        if not processes.is_rank_zero():
+            return {}
+        trainer = alone(job, root, work, trainer.checkpoint_dir)
+    record = {"devices": devices, **measure(trainer, timer, seconds)}
+    if curve is not None:
+        end = point(record["iterations"], timer.seconds, record, record["gaussians"])
+        record["curve"] = [*curve.points, end]
+    return record
 
-    with timed("setup"):
+
+@contextlib.contextmanager
+def timed(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Time the block, or the function that this decorates, and add `NAME_seconds` to `seconds`."""
+    from benchmarks import evaluate
+
+    begin = evaluate.now()
+    yield
+    seconds[f"{name}_seconds"] = evaluate.now() - begin
+
+
+def set_up(job: Job, root: Path, work: Path, devices: int, seconds: dict[str, float]) -> Any:
+    """Return the job's nerfstudio trainer, set up to train on so many devices; add the setup's times to `seconds`.
+
+    Raises as `build_config`, and ValueError if several devices were to train, and one would.
+    """
+    from nerfstudio.scripts.train import _set_random_seed
+
+    with timed("setup", seconds):
         config = build_config(job.scene, job.row, job.seed, root, work)
         _set_random_seed(job.seed)
         trainer: Any = config.setup(local_rank=int(os.environ.get("LOCAL_RANK", "0")), world_size=devices)
         model_class: Any = config.pipeline.model._target
         populate = model_class.populate_modules
-        model_class.populate_modules = timed("initialization")(populate)
+        model_class.populate_modules = timed("initialization", seconds)(populate)
         try:
             trainer.setup(test_mode="test")  # "val" would evaluate on blender's validation views
         finally:
@@ -146,12 +167,33 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
             f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
             "method knows one only: measure it with one GPU, or set share_always to true."
         )
-    pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
-    with timed("load"):  # else the first iteration decodes all images
-        train_images, _ = datamanager.cached_train, datamanager.cached_eval
+    return trainer
+
+
+def train(
+    job: Job, root: Path, work: Path, devices: int, seconds: dict[str, float]
+) -> tuple[Any, LoopTimer, Curve | None]:
+    """Train as the job says, and add the times of all that comes before the loop to `seconds`.
+
+    Returns:
+        The trainer, the loop's timer, and the curve if the job asks for one and one device trains.
+
+    Raises as `set_up`, and RuntimeError if the training loop stopped early.
+    """
+    import torch
+
+    from benchmarks.curve import Curve, LoopTimer
+
+    trainer = set_up(job, root, work, devices, seconds)
+    pipeline = trainer.pipeline
+    datamanager = pipeline.datamanager
+    model = pipeline.model
+    with timed("load", seconds):  # else the first iteration decodes all images
+        train_images = datamanager.cached_train
+        _ = datamanager.cached_eval
     if devices == 1:  # A model that several processes share draws nothing alone, and compiles in the setup.
         # gsplat's, Triton's and torch.compile's kernels build at the first call, once per machine.
-        with timed("warmup"):
+        with timed("warmup", seconds):
             camera = datamanager.train_dataset.cameras[:1].to(trainer.device)
             pipeline.eval()
             outputs = model.get_outputs(camera)
@@ -162,10 +204,11 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
                 model.get_outputs(camera)
             pipeline.train()
         if hasattr(pipeline, "structure_cache"):  # splatfacto's pipeline has none
-            with timed("structure_tensor"):
+            with timed("structure_tensor", seconds):
                 pipeline.structure_cache.fill()
 
-    timer, curve = LoopTimer(), None
+    timer = LoopTimer()
+    curve = None
     if job.row.curve_every is not None and devices == 1:
         curve = Curve(job.row.curve_every, timer)
         curve.attach(trainer)
@@ -173,18 +216,23 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     trainer.train()
     if not timer.finished:
         raise RuntimeError("the training loop stopped before its last iteration.")
-    if devices > 1:
-        if not processes.is_rank_zero():
-            return {}
-        trainer = alone(job, root, work, trainer.checkpoint_dir)
-        pipeline, datamanager, model = trainer.pipeline, trainer.pipeline.datamanager, trainer.pipeline.model
+    return trainer, timer, curve
 
+
+def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[str, Any]:
+    """Evaluate a trained model on the held-out views; return all of `run_row` but `devices` and `curve`."""
+    import torch
+
+    from benchmarks import evaluate
+
+    pipeline = trainer.pipeline
+    datamanager = pipeline.datamanager
+    model = pipeline.model
     pipeline.eval()
     views = datamanager.fixed_indices_eval_dataloader
     held_out = evaluate.quality(model, views, evaluate.load_lpips())
     held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
-    record = {
-        "devices": devices,
+    return {
         "iterations": trainer.config.max_num_iterations,
         "views_per_iteration": model.plan.views_per_iteration if hasattr(model, "plan") else 1,
         "loop_seconds": timer.seconds,
@@ -197,10 +245,6 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         "eval_views": len(views),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
-    if curve is not None:
-        end = point(trainer.config.max_num_iterations, timer.seconds, held_out, int(model.num_points))
-        record["curve"] = [*curve.points, end]
-    return record
 
 
 def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:

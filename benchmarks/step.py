@@ -19,9 +19,9 @@ from benchmarks.evaluate import now
 from benchmarks.table import grid
 from sadgs_ns import kernels
 from sadgs_ns.method.losses import photometric_loss
+from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.screen_gradients import accumulate_gradients, keep_gradient
 from sadgs_ns.method.statistics import observe
-from sadgs_ns.method.strategy import empty_state
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
@@ -70,7 +70,7 @@ class Step:
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
         self.optimizers = {name: FusedAdam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
-        self.noted = torch.zeros(1, device=device)
+        self.nonfinite_flag = torch.zeros(1, device=device)
         self.state: dict[str, Any] = empty_state(gaussians, device)
         angles = torch.arange(views, device=device) * (2 * math.pi / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
@@ -124,12 +124,14 @@ class Step:
         """Adam on all parameters that have gradients: our kernel in one launch, as in training."""
         gradients = {name: p.grad for name, p in self.params.items() if p.grad is not None}
         update = AdamUpdate({name: self.optimizers[name] for name in gradients})
-        update.launch(gradients, update.factors().to(self.noted.device, non_blocking=True), self.noted)
+        update.launch(
+            gradients, update.factors().to(self.nonfinite_flag.device, non_blocking=True), self.nonfinite_flag
+        )
         for name, gradient in gradients.items():
             self.params[name].grad = gradient  # torch's Adam has used it up, and this may be called again.
 
     def __call__(self, after: Callable[[str], None] = lambda phase: None) -> None:
-        """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `memory.step_bytes`."""
+        """A whole step; every `ETA_EVERY`th observes η, and `after` hears the phases of `step_memory.step_bytes`."""
         self.forget_gradients()
         drawn = self.draw()
         if self.count % ETA_EVERY == 0:

@@ -97,8 +97,10 @@ def _check_cuda() -> Iterator[Finding]:
     from sadgs_ns import kernels
 
     device = torch.device("cuda")
-    name, (free, total) = torch.cuda.get_device_name(device), torch.cuda.mem_get_info(device)
-    capability, built = torch.cuda.get_device_capability(device), torch.cuda.get_arch_list()
+    name = torch.cuda.get_device_name(device)
+    (free, total) = torch.cuda.mem_get_info(device)
+    capability = torch.cuda.get_device_capability(device)
+    built = torch.cuda.get_arch_list()
     driver = re.search(r"\d{3}\.[\d.]+", _DRIVER_FILE.read_text()) if _DRIVER_FILE.exists() else None
     sm = "sm_{}{}".format(*capability)
     yield note(f"GPU: {name}, {sm}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA {torch.version.cuda}.")

@@ -91,15 +91,19 @@ def export(options: Export) -> int:
     A printed line says what each option took away. Nothing in the run's folder is executed, not even `config.yml`.
     Raise InputError if the run, the capture, an option or the output cannot be used, WriteError if writing fails.
     """
-    is_page, is_mesh = format_of(options.output) == ".html", format_of(options.output) == MESH
+    is_page = format_of(options.output) == ".html"
+    is_mesh = format_of(options.output) == MESH
     _check(options)
     if is_mesh:
         load_open3d()  # It may be missing, which the user shall know before views are rendered.
     folders = _checkpoint_of(options.run).absolute().parents[:2]
     folder = next((folder for folder in folders if (folder / TRANSFORMS_NAME).is_file()), folders[-1])
-    from sadgs_ns.geometry.cleaning import Cleaning  # It imports torch.
+    # These import torch.
+    from sadgs_ns.geometry.cleaning import Cleaning
+    from sadgs_ns.viewer.cleaning_text import check_options
 
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
+    check_options(cleaning)
     similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
     params, drawing = read_checkpoint(options.run)
     if similarity is not None:
@@ -115,7 +119,8 @@ def export(options: Export) -> int:
 
         return write_mesh(options.output, params, cameras, similarity, options.voxel_size, drawing)
     if is_page and cameras is not None:
-        pose, focal = cameras.camera_to_worlds[0].double().numpy(), float(cameras.Ks[0, 0, 0])
+        pose = cameras.camera_to_worlds[0].double().numpy()
+        focal = float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
     up = np.eye(3)[2] if similarity is None else similarity.orthogonal[:, 2]
     x, y, z = (np.eye(3)[np.abs(up).argmax()] * np.sign(up)).tolist()  # The nearest axis of the file's frame
@@ -123,7 +128,8 @@ def export(options: Export) -> int:
 
 
 def _check(options: Export) -> None:
-    suffix, voxel_size = format_of(options.output), options.voxel_size
+    suffix = format_of(options.output)
+    voxel_size = options.voxel_size
     if suffix == ".html" and options.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
     if voxel_size is not None and suffix != MESH:
@@ -148,21 +154,25 @@ def _cleaned(
     from rich.console import Console
     from rich.progress import track
 
-    from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
+    from sadgs_ns.geometry.cleaning import Cleaning, choose_remaining, measure_visibility
     from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+    from sadgs_ns.viewer.cleaning_text import removal_sentences
 
     if cleaning == Cleaning():
         return params
-    device, seen = torch.device("cuda" if torch.cuda.is_available() else "cpu"), None
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    seen = None
     shapes = {name: params[name].to(device) for name in ("means", "quats", "scales", "opacities")}
     if cleaning.needs_views and cameras is not None:
-        viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device), cameras.Ks.to(device)
+        viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds).to(device)
+        Ks = cameras.Ks.to(device)
         views = [(viewmat, K, *size) for viewmat, K, size in zip(viewmats, Ks, cameras.sizes, strict=True)]
         console = Console(stderr=True)
         shown = track(views, "Looking from the training views", console=console, disable=not console.is_terminal)
         seen = measure_visibility(shapes, shown, drawing)
-    stays, sentences = find_remaining(shapes, cleaning, seen)
-    print("\n".join(sentences))
+    remaining = choose_remaining(shapes, cleaning, seen)
+    stays = remaining.stays
+    print("\n".join(removal_sentences(cleaning, remaining)))
     if not stays.any():
         problem = f"These options take away all {len(stays):,} Gaussians"
         raise InputError(f"{problem}: nothing is written, so take fewer away.")
@@ -197,7 +207,8 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
     chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
     assert chosen is not None
-    checkpoint, loaded = chosen[0], chosen[1]["pipeline"]
+    checkpoint = chosen[0]
+    loaded = chosen[1]["pipeline"]
     loaded = loaded if isinstance(loaded, dict) else {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):

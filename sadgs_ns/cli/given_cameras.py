@@ -10,7 +10,7 @@ from pathlib import Path
 from sadgs_ns.cli.sadgs_options import Sadgs, adapt_remedy
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
-from sadgs_ns.data.checks.layouts import find_cameras
+from sadgs_ns.data.layouts import find_cameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.placing.folder import images_of
 from sadgs_ns.placing.stamps import changes_of, photo_stamps

@@ -80,9 +80,12 @@ def render_depths(
 ) -> Iterator[DepthView]:
     """Render colours and expected depth in some of the views; the parameters are finite, on the device that renders."""
     device = params["means"].device
-    viewmats, Ks = viewmats_from_camera_to_world(cameras.camera_to_worlds), cameras.Ks
-    scales, opacities = params["scales"].exp(), params["opacities"].flatten().sigmoid()
-    first, rest = params["features_dc"], params["features_rest"]
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    Ks = cameras.Ks
+    scales = params["scales"].exp()
+    opacities = params["opacities"].flatten().sigmoid()
+    first = params["features_dc"]
+    rest = params["features_rest"]
     degree = round((1 + rest.shape[1]) ** 0.5) - 1
     colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
     gaussians = Gaussians(params["means"], params["quats"], scales, opacities, colors)
@@ -94,5 +97,6 @@ def render_depths(
         seen = alpha >= MIN_ALPHA  # [1, H, W, 1]
         own = (render[..., :3] / alpha.clamp_min(MIN_ALPHA)).clamp(0, 1)  # The background, black, is taken away.
         depth = torch.where(seen, render[..., 3:], 0.0)
-        K, viewmat = np.asarray(Ks[index], np.float64), np.asarray(viewmats[index], np.float64)
+        K = np.asarray(Ks[index], np.float64)
+        viewmat = np.asarray(viewmats[index], np.float64)
         yield DepthView(depth[0, ..., 0].cpu().numpy(), own[0].cpu().numpy(), K, viewmat)

@@ -17,7 +17,7 @@ from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.cli.sadgs_options import FORMAT_NAMES, adapt_remedy
 from sadgs_ns.cli.status_line import StatusLine
-from sadgs_ns.data.checks.layouts import find_cameras
+from sadgs_ns.data.layouts import find_cameras
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing.plan import Summary
 

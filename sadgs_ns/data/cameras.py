@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from sadgs_ns.data.checks.geometry import NO_COEFFICIENTS
+from sadgs_ns.data.views import NO_COEFFICIENTS
 from sadgs_ns.errors import InputError
 
 _UNDISTORTED = (CameraType.FISHEYE, CameraType.FISHEYE624)
@@ -27,11 +27,14 @@ def check_camera_types(cameras: Cameras) -> None:
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras with a distortion coefficient other than 0. Others would be rendered wrongly, as pinholes.
     """
-    for index, camera_type in enumerate(map(CameraType, cameras.camera_type.flatten().tolist())):
-        where, coefficients = f"Camera {index} is {camera_type.name}", cameras.distortion_params
-        if camera_type in _UNDISTORTED and (coefficients is None or not coefficients[index].any()):
-            raise InputError(f"{where} {NO_COEFFICIENTS}")
-        if camera_type not in (CameraType.PERSPECTIVE, *_UNDISTORTED):
+    coefficients = cameras.distortion_params  # [C, 6 or 12] or None
+    for index, number in enumerate(cameras.camera_type.flatten().tolist()):
+        camera_type = CameraType(number)
+        where = f"Camera {index} is {camera_type.name}"
+        if camera_type in _UNDISTORTED:
+            if coefficients is None or not coefficients[index].any():
+                raise InputError(f"{where} {NO_COEFFICIENTS}")
+        elif camera_type != CameraType.PERSPECTIVE:
             problem = f"{where}, which sadgs cannot render: it renders PERSPECTIVE cameras only"
             remedy = "Make perspective images of it (ns-process-data does so with --camera-type equirectangular)"
             raise InputError(f"{problem}. {remedy}.")
@@ -44,10 +47,13 @@ def check_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
     focal length of almost 0, or a centre far outside the image.
     """
     sizes = torch.cat([cameras.width, cameras.height], dim=-1)  # [C, 2] px
-    focals, centers = torch.cat([cameras.fx, cameras.fy], dim=-1), torch.cat([cameras.cx, cameras.cy], dim=-1)
-    fits = (focals > 0.01 * sizes) & (centers > 0) & (centers < sizes)  # 1 % is a field of view of 179°
-    of_fisheye = (cameras.camera_type == torch.tensor([t.value for t in _UNDISTORTED]).to(cameras.camera_type)).any(-1)
-    for index in (of_fisheye & ~fits.all(dim=-1)).nonzero().flatten().tolist():
+    focals = torch.cat([cameras.fx, cameras.fy], dim=-1)  # [C, 2] px
+    centers = torch.cat([cameras.cx, cameras.cy], dim=-1)  # [C, 2] px
+    has_focals = (focals > 0.01 * sizes).all(dim=-1)  # 1 % is a field of view of 179°
+    has_center = ((centers > 0) & (centers < sizes)).all(dim=-1)
+    fisheyes = torch.tensor([camera_type.value for camera_type in _UNDISTORTED]).to(cameras.camera_type)
+    is_fisheye = (cameras.camera_type == fisheyes).any(dim=-1)  # [C]
+    is_black = is_fisheye & ~(has_focals & has_center)
+    for index in is_black.nonzero().flatten().tolist():
         problem = f"{names[index]} is a FISHEYE image that nerfstudio could not undistort"
-        why = "its field of view is too close to 180°"
-        raise InputError(f"{problem}, for {why}: crop it, or undistort it yourself.")
+        raise InputError(f"{problem}, for its field of view is too close to 180°: crop it, or undistort it yourself.")

@@ -16,7 +16,7 @@ from sadgs_ns.errors import InputError, reason
 
 Array = NDArray[np.float64]
 
-TRANSFORMS_NAME = "dataparser_transforms.json"  # In it nerfstudio's trainer notes how it moved the capture
+TRANSFORMS_NAME = "dataparser_transforms.json"  # In this file nerfstudio's trainer writes how it moved the capture.
 FRAME_KEYS = ("dataparser_transform", "dataparser_scale")
 """Keys of a `transforms.json` that fix how its data is moved, so that adding photos leaves the frame of training."""
 _TOLERANCE = 1e-4  # Largest deviation from a similarity of a transform in float32, relative to its scale
@@ -24,7 +24,7 @@ _TOLERANCE = 1e-4  # Largest deviation from a similarity of a transform in float
 
 @dataclass(frozen=True)
 class Similarity:
-    """A map x ↦ scale · orthogonal · x + translation from one world frame to another."""
+    """The map x ↦ scale · orthogonal · x + translation from one world frame to another."""
 
     scale: float  # Factor by which lengths grow; it is positive
     orthogonal: Array  # A rotation, or a rotation times −1, which is a reflection. [3, 3]
@@ -32,20 +32,27 @@ class Similarity:
 
     @staticmethod
     def of(transform: Array) -> Similarity:
-        """Return the similarity that a matrix [3, 4] is, up to rounding; raise ValueError if it is none."""
+        """Return a matrix [3, 4] as a similarity; raise ValueError if it is none, even up to rounding."""
+        error = ValueError("it is no rotation, scale and translation")
+        if not np.isfinite(transform).all():
+            raise error
         linear = np.asarray(transform[:, :3], dtype=np.float64)
-        if np.isfinite(transform).all() and (scale := abs(np.linalg.det(linear)) ** (1 / 3)) > 0:
-            left, _, right = np.linalg.svd(linear)
-            # This orthogonal matrix is the nearest one, and keeps the determinant's sign.
-            orthogonal = np.asarray(left @ right, dtype=np.float64)
-            if np.abs(linear - scale * orthogonal).max() < _TOLERANCE * scale:
-                return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
-        raise ValueError("it is no rotation, scale and translation")
+        scale = abs(np.linalg.det(linear)) ** (1 / 3)
+        if not scale > 0:
+            raise error
+        left, _, right = np.linalg.svd(linear)
+        # This orthogonal matrix is the nearest one, and keeps the determinant's sign.
+        orthogonal = np.asarray(left @ right, dtype=np.float64)
+        deviation = np.abs(linear - scale * orthogonal).max()
+        if not deviation < _TOLERANCE * scale:  # It may be NaN.
+            raise error
+        return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
 
     def inverse(self) -> Similarity:
         """Return the map back."""
         back = self.orthogonal.T
-        return Similarity(1 / self.scale, back, -back @ self.translation / self.scale)
+        translation = -back @ self.translation / self.scale
+        return Similarity(1 / self.scale, back, translation)
 
     def positions(self, means: Array) -> Array:
         """Return positions in the new frame. [N, 3] → [N, 3]"""
@@ -53,7 +60,9 @@ class Similarity:
 
     def poses(self, poses: Array) -> Array:
         """Return camera-to-world poses in the new frame. [C, 3, 4] → [C, 3, 4]"""
-        return np.concatenate([self.orthogonal @ poses[:, :, :3], self.positions(poses[:, :, 3])[:, :, None]], axis=2)
+        rotations = self.orthogonal @ poses[:, :, :3]  # [C, 3, 3]
+        positions = self.positions(poses[:, :, 3])  # [C, 3]
+        return np.concatenate([rotations, positions[:, :, None]], axis=2)
 
     def log_scales(self, scales: Array) -> Array:
         """Return logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
@@ -66,21 +75,27 @@ class Similarity:
         """
         from scipy.spatial.transform import Rotation  # It takes half a second to import.
 
-        turn = Rotation.from_matrix(self.orthogonal * np.sign(np.linalg.det(self.orthogonal)))
-        lengths, turned = np.linalg.norm(quats, axis=1), quats.copy()
-        sound = (lengths > 0) & np.isfinite(lengths)  # Scipy refuses the others.
-        turned[sound] = (turn * Rotation.from_quat(quats[sound][:, [1, 2, 3, 0]])).as_quat()[:, [3, 0, 1, 2]]
+        sign = np.sign(np.linalg.det(self.orthogonal))
+        turn = Rotation.from_matrix(sign * self.orthogonal)
+        lengths = np.linalg.norm(quats, axis=1)  # [N]
+        is_sound = (lengths > 0) & np.isfinite(lengths)  # Scipy refuses the others.
+        before = Rotation.from_quat(quats[is_sound][:, [1, 2, 3, 0]])  # Scipy's quaternions are xyzw.
+        after = (turn * before).as_quat()  # [S, 4]
+        turned = quats.copy()
+        turned[is_sound] = after[:, [3, 0, 1, 2]]
         return turned
 
     def harmonics(self, degree: int) -> Array:
         """Return the matrix D with which colours' coefficients c of degree 0 … 3 become D c in the new frame.
 
-        Turned harmonics are sums of harmonics, so that a few directions tell D. [(degree + 1)², (degree + 1)²]
+        Turned harmonics are sums of harmonics, so that a few directions determine D. [(degree + 1)², (degree + 1)²]
         """
         directions = np.random.default_rng(0).normal(size=(64, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         before = spherical_harmonics(directions @ self.orthogonal, degree)
-        return np.linalg.lstsq(spherical_harmonics(directions, degree), before, rcond=None)[0]
+        after = spherical_harmonics(directions, degree)
+        solution, *_ = np.linalg.lstsq(after, before, rcond=None)
+        return solution
 
 
 def spherical_harmonics(directions: Array, degree: int) -> Array:
@@ -106,7 +121,7 @@ def from_data(path: Path) -> Similarity:
     """Return the map from the data's world to nerfstudio's from a run's file; raise InputError if it has none."""
     try:
         content = json.loads(path.read_bytes())
-        return _moved_by(content["transform"], content["scale"])
+        return _similarity_of(content["transform"], content["scale"])
     except (OSError, KeyError, TypeError, ValueError) as error:
         problem = f"{path} does not tell how to return to the data's frame ({reason(error)})"
         raise InputError(f"{problem}: copy it from the run again, or export in nerfstudio's frame.") from error
@@ -117,14 +132,18 @@ def fixed_frame(meta: Mapping[str, Any], path: Path) -> Similarity | None:
     if not any(name in meta for name in FRAME_KEYS):
         return None
     try:
-        return _moved_by(*(meta[name] for name in FRAME_KEYS))
+        transform, scale = (meta[name] for name in FRAME_KEYS)
+        return _similarity_of(transform, scale)
     except (KeyError, TypeError, ValueError) as error:
-        told = f"{path} does not tell with {' and '.join(FRAME_KEYS)} how its data is to be moved ({reason(error)})"
-        raise InputError(f"{told}: remove both, or copy them from the dataparser_transforms.json of a run.") from error
+        problem = f"{path} does not tell with {' and '.join(FRAME_KEYS)} how its data is to be moved ({reason(error)})"
+        remedy = "remove both, or copy them from the dataparser_transforms.json of a run"
+        raise InputError(f"{problem}: {remedy}.") from error
 
 
-def _moved_by(transform: Any, scale: Any) -> Similarity:
-    transform, scale = np.array(transform, dtype=np.float64), float(scale)
-    if transform.shape != (3, 4) or not scale > 0:
+def _similarity_of(transform: Any, scale: Any) -> Similarity:
+    """Return the map of values of JSON, a transform [3, 4] and a scale after it; raise ValueError if it is none."""
+    matrix = np.array(transform, dtype=np.float64)
+    factor = float(scale)
+    if matrix.shape != (3, 4) or not factor > 0:
         raise ValueError("it has no transform of 3 rows and 4 columns and a scale above 0")
-    return Similarity.of(scale * transform)
+    return Similarity.of(factor * matrix)

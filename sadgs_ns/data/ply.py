@@ -12,17 +12,16 @@ from numpy.typing import NDArray
 
 from sadgs_ns.errors import InputError, reason
 
-_PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")
-COLORS = [[prefix + name for name in names] for prefix in _PREFIXES for names in (("red", "green", "blue"), "rgb")]
-"""Names that programs give to colours, in small letters."""
+_CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # Names that programs give to colours, in small letters
+_PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")  # These may stand before them.
 GREY = 127  # Colour of points without one, in 0 … 255
 
 
 def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
-    Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535: the
-    largest one tells. Points without colours are grey. Raise InputError if the file is broken or holds no points.
+    Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535, as the
+    largest one shows. Points without colours are grey. Raise InputError if the file is broken or holds no points.
     """
     try:
         vertices = _read_vertices(path)
@@ -33,14 +32,27 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         raise InputError(f"{path} cannot be read ({reason(error)}): restore it.") from error
     except Exception as error:  # A damaged header may lead plyfile's parser to anything.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
-    named = {name.lower(): name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "fiu"}
-    if (channels := next((names for names in COLORS if named.keys() >= set(names)), None)) is None:
+    channels = _find_channels(vertices.dtype)
+    if channels is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
-    colors = np.stack([vertices[named[channel]] for channel in channels], axis=-1).astype(np.float64)
+    colors = np.stack([vertices[channel] for channel in channels], axis=-1).astype(np.float64)  # [P, 3]
     largest = colors[np.isfinite(colors)].max(initial=0.0)
-    is_share = vertices.dtype[named[channels[0]]].kind == "f" and largest <= 1
-    colors *= 255 if is_share else 1 if largest <= 255 else 255 / 65535
+    if largest <= 1 and vertices.dtype[channels[0]].kind == "f":
+        colors *= 255
+    elif largest > 255:
+        colors *= 255 / 65535
     return positions, np.rint(np.nan_to_num(colors)).clip(0, 255).astype(np.uint8)
+
+
+def _find_channels(dtype: np.dtype[Any]) -> list[str] | None:
+    """Return the names of red, green and blue among the numbers of a vertex, or None if they are not there."""
+    numbers = {name.lower(): name for name in dtype.names or () if dtype[name].kind in "fiu"}
+    for prefix in _PREFIXES:
+        for channels in _CHANNELS:
+            names = [prefix + channel for channel in channels]
+            if all(name in numbers for name in names):
+                return [numbers[name] for name in names]
+    return None
 
 
 def _read_vertices(path: Path) -> NDArray[Any]:
@@ -49,18 +61,24 @@ def _read_vertices(path: Path) -> NDArray[Any]:
 
     with path.open("rb") as file:
         found = re.match(rb".*?end_header\s*?\n", file.read(1 << 16), re.DOTALL)
-        header = found[0] if found else b""
-        # plyfile reads what follows a header at once, so it is given one that promises nothing.
-        empty = PlyData.read(io.BytesIO(re.sub(rb"(?m)^(element\s+\S+)\s+\d+", rb"\1 0", header)))
+        header = b""
+        if found:
+            header = found[0]
+        # plyfile reads the data after a header at once, so it is given a header that promises none.
+        empty_header = re.sub(rb"(?m)^(element\s+\S+)\s+\d+", rb"\1 0", header)
+        empty = PlyData.read(io.BytesIO(empty_header))
         if "vertex" not in empty:
             raise ValueError("it has no vertices")
         count = int(re.findall(rb"(?m)^element\s+vertex\s+(\d+)", header)[0])
         dtype = np.dtype(empty["vertex"].dtype())
         if count == 0:
             return np.empty(0, dtype)
-        if empty.text and empty.elements[0].name == "vertex" and not dtype.hasobject:  # Lists are objects.
+        vertices_come_first = empty.elements[0].name == "vertex"
+        has_lists = dtype.hasobject
+        if empty.text and vertices_come_first and not has_lists:
             file.seek(len(header))
-            if sum(1 for _ in file) < count:
+            lines = sum(1 for _ in file)
+            if lines < count:
                 raise InputError(f"{path} is cut off: its header promises {count} points: restore it.")
             file.seek(len(header))
             return np.loadtxt(file, dtype, comments=None, max_rows=count, ndmin=1)

@@ -1,4 +1,4 @@
-"""The cameras of a finished run, read from its capture; nothing of the run's files is executed."""
+"""The cameras of a finished run, read from its capture. No code that the run's files name is executed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _CLASS = "<class>"  # Key of an object's class in its mapping
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Reads Python objects as mappings, lists, paths and texts, as they are written, and makes none of them."""
+    """Reads Python objects as the mappings, lists, paths and texts that they are in the file, and makes no object."""
 
 
 def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
@@ -38,7 +38,9 @@ def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
         return loader.construct_mapping(node, deep=True) | {_CLASS: kind.removeprefix("object:")}
     if isinstance(node, yaml.SequenceNode):
         values = loader.construct_sequence(node, deep=True)
-        return Path(*values) if kind.startswith("object/apply:pathlib.") else values
+        if kind.startswith("object/apply:pathlib."):
+            return Path(*values)
+        return values
     return loader.construct_scalar(node)  # type: ignore[arg-type]
 
 
@@ -53,74 +55,94 @@ def find_capture(run: Path) -> tuple[Path, dict[str, Any]]:
         parser = manager["dataparser"]
         return Path(manager.get("data") or parser["data"]), parser
     except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
-        what = type(error).__name__ if isinstance(error, KeyError) else reason(error)
-        raise InputError(f"{path} does not tell where the capture is ({what}): give its folder with --data.") from error
+        cause = reason(error)
+        if isinstance(error, KeyError):  # Its text is the key alone.
+            cause = type(error).__name__
+        problem = f"{path} does not tell where the capture is ({cause})"
+        raise InputError(f"{problem}: give its folder with --data.") from error
 
 
-def _parser(settings: Mapping[str, Any], data: Path) -> Any:
+def _make_parser(settings: Mapping[str, Any], data: Path) -> Any:
     """Return a parser with settings as `find_capture` returns them, or the one that fits if they name none."""
     # nerfstudio takes ten seconds to import, which `--help` and wrong arguments need not wait for.
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 
-    from sadgs_ns.data.checks.images import automatic_factor
-    from sadgs_ns.data.parsers import OWN, PARSERS, AutomaticDataParserConfig, choose_parser
+    from sadgs_ns.data.images import automatic_factor
+    from sadgs_ns.data.own_parsers import OWN
+    from sadgs_ns.data.parsers import PARSERS, AutomaticDataParserConfig, choose_parser
 
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
-    parser: Any = copy.deepcopy(known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig()))
-    for field in fields(parser):
+    named = known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig())
+    config: Any = copy.deepcopy(named)
+    for field in fields(config):
         if field.name in settings and not field.name.startswith("_"):
-            setattr(parser, field.name, settings[field.name])
-    parser.data = data
-    config = FullImageDatamanagerConfig(data=data, dataparser=parser)
-    choose_parser(config)
-    parser = config.dataparser
-    parser._target = OWN.get(parser._target, parser._target)
+            setattr(config, field.name, settings[field.name])
+    config.data = data
+    manager = FullImageDatamanagerConfig(data=data, dataparser=config)
+    choose_parser(manager)
+    config = manager.dataparser
+    config._target = OWN.get(config._target, config._target)
     # Points are not needed. nerfstudio reads some with open3d, which a machine may lack, or asks whether to make a PLY.
-    for name, value in (("load_3D_points", False), ("ply_path", None)):
-        if hasattr(parser, name):
-            setattr(parser, name, value)
-    made = parser.setup()
-    if isinstance(made, ColmapDataParser):  # It asks whether to make smaller images, which are not needed either.
-        first = data / parser.images_path / colmap.image_names(data / parser.colmap_path)[0]
-        made._downscale_factor = parser.downscale_factor or automatic_factor(first)
-    return made
+    if hasattr(config, "load_3D_points"):
+        config.load_3D_points = False
+    if hasattr(config, "ply_path"):
+        config.ply_path = None
+    parser = config.setup()
+    if isinstance(parser, ColmapDataParser):  # It asks whether to make smaller images, which are not needed either.
+        first = data / config.images_path / colmap.image_names(data / config.colmap_path)[0]
+        parser._downscale_factor = config.downscale_factor or automatic_factor(first)
+    return parser
 
 
-def _parse(settings: Mapping[str, Any], data: Path, as_fits: bool) -> Any:
-    """Parse with settings for `_parser`; if that fails, as fits the folder, if that has another layout."""
+def _parse(settings: Mapping[str, Any], data: Path, may_be_other: bool) -> Any:
+    """Parse the training views of a capture with settings for `_make_parser`.
+
+    If that fails and the folder may have another layout than the settings are for, use the parser that fits.
+    """
     try:
-        return _parser(settings, data).get_dataparser_outputs(split="train")
+        return _make_parser(settings, data).get_dataparser_outputs(split="train")
     except Exception:
-        fitting = _parser({}, data) if as_fits and settings else None
-        if fitting is None or settings.get(_CLASS, "").endswith(f".{type(fitting.config).__qualname__}"):
+        if not settings or not may_be_other:
+            raise
+        fitting = _make_parser({}, data)
+        if settings.get(_CLASS, "").endswith(f".{type(fitting.config).__qualname__}"):
             raise  # The folder may hold another COLMAP model than the run's, whose frame is another.
         return fitting.get_dataparser_outputs(split="train")
 
 
+def _locate(run: Path, data: Path | None) -> tuple[Path, dict[str, Any]]:
+    """Return a capture's folder, which is `data` if given, and its parser's settings; raise InputError if unknown."""
+    if data is None:
+        folder, settings = find_capture(run)
+        if not folder.exists():
+            problem = f"{folder}, on which {run} was trained, is not there"
+            raise InputError(f"{problem}: give the capture's folder with --data.")
+        return folder, settings
+    try:
+        _, settings = find_capture(run)
+    except InputError:
+        settings = {}
+    return data, settings
+
+
 def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
-    """Read a run's training cameras in its frame, as the run did, or as fits the folder if it does not tell how.
+    """Read a run's training cameras in its frame, with the run's parser, or one that fits if the run names none.
 
     `data` is the capture's folder, by default where the run's `config.yml` says that it was. Raise InputError if the
     capture cannot be read, or the run does not tell how it moved it.
     """
+    folder, settings = _locate(run, data)
     try:
-        found, settings = find_capture(run)
-    except InputError:
-        if data is None:
-            raise
-        found, settings = data, {}
-    if data is None and not found.exists():
-        raise InputError(f"{found}, on which {run} was trained, is not there: give the capture's folder with --data.")
-    found = data or found
-    try:
-        outputs = _parse(settings, found, as_fits=data is not None)
+        outputs = _parse(settings, folder, may_be_other=data is not None)
     except Exception as error:  # The parsers' errors are of every kind.
-        raise InputError(f"{found} cannot be read as a capture ({reason(error)}): give another with --data.") from error
-    cameras, poses = outputs.cameras, outputs.cameras.camera_to_worlds.double().numpy()
+        problem = f"{folder} cannot be read as a capture ({reason(error)})"
+        raise InputError(f"{problem}: give another with --data.") from error
+    cameras = outputs.cameras
+    poses = cameras.camera_to_worlds.double().numpy()  # [C, 3, 4]
     if (run / TRANSFORMS_NAME).is_file():  # The run's own options may have moved the capture otherwise.
-        transform = outputs.dataparser_scale * outputs.dataparser_transform.double().numpy()
-        for similarity in (Similarity.of(transform).inverse(), from_data(run / TRANSFORMS_NAME)):
-            poses = similarity.poses(poses)
+        to_frame = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
+        poses = to_frame.inverse().poses(poses)
+        poses = from_data(run / TRANSFORMS_NAME).poses(poses)
     sizes = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
     return RunCameras(torch.from_numpy(poses).float(), cameras.get_intrinsics_matrices(), sizes)

@@ -1,4 +1,4 @@
-"""Text in UTF-8. Editors of Windows write a mark before it that nerfstudio's readers take for content."""
+"""Text in UTF-8. Editors of Windows write a byte order mark before it, which nerfstudio's readers take for content."""
 
 from __future__ import annotations
 

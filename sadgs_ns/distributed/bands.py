@@ -6,9 +6,9 @@ from collections import defaultdict
 from functools import lru_cache
 from typing import NamedTuple
 
-ROWS, MARGIN = 16, 16
-"""px. Views are cut at multiples of the first, as tiles are. The second are rows beyond a band that are drawn, too,
-because SSIM's window reaches 5 px beyond the rows that count."""
+ROWS = 16  # px; views are cut at multiples of this, as tiles are
+MARGIN = 16
+"""Rows beyond a band in px that are drawn, too, because SSIM's window reaches 5 px beyond the rows that count."""
 
 
 class Band(NamedTuple):
@@ -33,10 +33,15 @@ def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:
     for rank in range(num_ranks):
         start, end = (r * num_views * units // num_ranks for r in (rank, rank + 1))
         for view in range(start // units, -(-end // units)):
-            begin, stop = max(start - view * units, 0), min(end - view * units, units)
-            first, last = begin * ROWS, height if stop == units else stop * ROWS
+            begin = max(start - view * units, 0)
+            stop = min(end - view * units, units)
+            first = begin * ROWS
+            last = stop * ROWS
+            if stop == units:
+                last = height
             if begin < stop:
-                top, bottom = max(first - MARGIN, 0), min(last + MARGIN, height)
+                top = max(first - MARGIN, 0)
+                bottom = min(last + MARGIN, height)
                 bands.append(Band(view, rank, first, last, top, bottom))
     return bands
 

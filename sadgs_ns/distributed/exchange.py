@@ -104,14 +104,17 @@ class _Exchanged(torch.autograd.Function):
     def forward(ctx: Any, exchange: Exchange, absgrad: bool, *projected: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
         _, means2d, _, _, opacities, _ = projected
         ctx.set_materialize_grads(False)
-        ctx.exchange, ctx.absgrad, ctx.shape = exchange, absgrad, opacities.shape
+        ctx.exchange = exchange
+        ctx.absgrad = absgrad
+        ctx.shape = opacities.shape
         ctx.save_for_backward(means2d)
         if exchange.fused:
             from sadgs_ns.kernels import exchange as kernel  # Triton need not be installed.
 
             rows = kernel.pack(*(value.detach().contiguous() for value in projected), places=exchange.places)
         else:
-            kernel, rows = None, pack([value.detach() for value in projected], exchange.places)
+            kernel = None
+            rows = pack([value.detach() for value in projected], exchange.places)
         outputs = []
         for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
             if not len(received):
@@ -143,7 +146,8 @@ class _Exchanged(torch.autograd.Function):
             dense.index_add_(0, exchange.places, rows)
         v_means2d, v_conics, v_opacities, v_colors, *v_absolute = dense.view(*ctx.shape, -1).split(widths, -1)
         if ctx.absgrad:
-            means2d.absgrad, means2d.grad2d = v_absolute[0], v_means2d
+            means2d.absgrad = v_absolute[0]
+            means2d.grad2d = v_means2d
         return None, None, None, v_means2d, None, v_conics, v_opacities[..., 0], v_colors
 
 
@@ -175,7 +179,8 @@ def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], numb
 
     [1, at least M, width] each, or [1, at least M] → [M, sum of the widths]. Those of our compositing are such parts.
     """
-    width, first = sum(widths), columns[0]
+    width = sum(widths)
+    first = columns[0]
     whole = all(value is not None for value in columns[:4])
     if whole and first is not None and first.dim() == 3 and first.stride()[1:] == (width, 1):
         starts = [first.data_ptr() + first.element_size() * sum(widths[:i]) for i in range(len(widths))]
@@ -191,12 +196,18 @@ def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], numb
 @torch.no_grad()
 def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
     """Return which Gaussians each band draws. bool [B, N]"""
-    radii, means2d = projected.radii, projected.means2d
+    radii = projected.radii
+    means2d = projected.means2d
     visible = drawn(radii, means2d)  # [V, N]
     if all(band.view == index for index, band in enumerate(bands)) and len(bands) == len(visible):
         return visible
-    y, reach = means2d[..., 1], radii[..., 1] if radii.dim() == 3 else radii  # [V, N]
-    below, above = y + reach, y - reach
+    y = means2d[..., 1]  # [V, N]
+    if radii.dim() == 3:
+        reach = radii[..., 1]  # [V, N]
+    else:
+        reach = radii
+    below = y + reach
+    above = y - reach
     return torch.stack(
         [visible[band.view] & (below[band.view] > band.top) & (above[band.view] < band.bottom) for band in bands]
     )

@@ -38,7 +38,8 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
 def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
     """Choose by priority all Gaussians before the first that does not fit; all together do not. bool [N]"""
     equal = growth > 0  # These agree in the digits so far with the first that does not fit.
-    before, threshold = 0, 0
+    before = 0
+    threshold = 0
     for shift, width in _DIGITS:
         digits = ((bits >> shift) & ((1 << width) - 1)).long()
         histogram = growth.new_zeros(1 << width).scatter_add_(0, digits, torch.where(equal, growth, 0))

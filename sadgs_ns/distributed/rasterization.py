@@ -42,9 +42,12 @@ def rasterize(
     projected = render.project(gaussians, cameras, options, begin_tiles=False)
     exchange = Exchange(world, projected, share_rows(len(cameras.viewmats), cameras.height, world.num_ranks))
     anchor, received = exchange.send(projected, options.absgrad)
-    pictures, num_pairs, num_pixels = [], 0, 0
+    pictures = []
+    num_pairs = 0
+    num_pixels = 0
     for band, splats in zip(exchange.bands, received, strict=True):
         colors, alphas, info = render.composite(splats, options)
         pictures.append(Picture(band, colors, alphas))
-        num_pairs, num_pixels = num_pairs + len(info["flatten_ids"]), num_pixels + splats.height * splats.width
+        num_pairs = num_pairs + len(info["flatten_ids"])
+        num_pixels = num_pixels + splats.height * splats.width
     return pictures, projected.info() | {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}

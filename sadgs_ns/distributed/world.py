@@ -123,7 +123,8 @@ class World:
     def rebalance(self, rows: Tensor) -> Tensor:
         """Return this process's rows after all are spread evenly; `sizes` stays, for other tensors. [N, …] → [N', …]"""
         new = self.even_sizes(self.total)
-        sent, received = _overlaps(self.sizes, new, self.rank), _overlaps(new, self.sizes, self.rank)
+        sent = _overlaps(self.sizes, new, self.rank)
+        received = _overlaps(new, self.sizes, self.rank)
         result = rows.new_empty((new[self.rank], *rows.shape[1:]))
         if math.prod(rows.shape[1:]):
             dist.all_to_all_single(result, rows.contiguous(), received, sent)
@@ -151,6 +152,7 @@ class World:
 
 def _overlaps(ours: Sequence[int], theirs: Sequence[int], rank: int) -> list[int]:
     """Return how many of the rows that `rank` has by `ours` each rank has by `theirs`."""
-    start, end = sum(ours[:rank]), sum(ours[: rank + 1])
+    start = sum(ours[:rank])
+    end = sum(ours[: rank + 1])
     ranges = pairwise(accumulate(theirs, initial=0))
     return [max(min(end, last) - max(start, first), 0) for first, last in ranges]

@@ -52,7 +52,8 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
 def _in_chunk(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return values [N, 3] as shares between their chunk's extremes, in [0, 1], and these, lowest first [chunks, 6]."""
     starts = np.arange(0, len(values), _CHUNK)
-    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    low = np.minimum.reduceat(values, starts)
+    high = np.maximum.reduceat(values, starts)
     chunk = np.arange(len(values)) // _CHUNK
     span = np.where(high > low, high - low, np.float32(1))
     return ((values - low[chunk]) / span[chunk]).astype(np.float32), np.concatenate([low, high], axis=1)

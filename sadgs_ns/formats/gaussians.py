@@ -86,7 +86,8 @@ def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
     The parameters are `means` [N, 3], `scales` (logarithms) [N, 3], `quats` (wxyz, of any length) [N, 4], `opacities`
     (logits) [N, 1] or [N], `features_dc` [N, 3] and `features_rest` [N, K, 3] with a K of 0, 3, 8 or 15.
     """
-    count, rest = len(params["means"]), params["features_rest"]
+    count = len(params["means"])
+    rest = params["features_rest"]
     bands = rest.shape[1] if rest.ndim == 3 else 0
     if bands not in (0, 3, 8, 15):
         raise ValueError(f"features_rest must hold the 0, 3, 8 or 15 harmonics of degree 1 to 3, got {bands}")

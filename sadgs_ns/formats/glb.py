@@ -14,8 +14,11 @@ from sadgs_ns.formats.gaussians import DEGREE_0, Context, Gaussians
 from sadgs_ns.formats.packing import sigmoid, to_bytes
 
 _EXTENSION = "KHR_gaussian_splatting"
-_FLOAT, _BYTE, _ARRAY_BUFFER, _POINTS = 5126, 5121, 34962, 0
-"""glTF's numbers for types of values, the purpose of a buffer, and the kind of primitives."""
+# glTF's numbers for types of values, the purpose of a buffer, and the kind of primitives
+_FLOAT = 5126
+_BYTE = 5121
+_ARRAY_BUFFER = 34962
+_POINTS = 0
 _MOST_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 

@@ -39,7 +39,9 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     Raise InputError if Node.js or its package cannot be run.
     """
     assert context.start is not None
-    page, content, settings = _page(), io.BytesIO(), _settings(context.start)
+    page = _page()
+    content = io.BytesIO()
+    settings = _settings(context.start)
     sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))), context)
     encoded = base64.b64encode(content.getvalue()).decode()
 
@@ -98,7 +100,8 @@ def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, mean
 
     The pose [3, 4] has OpenGL axes and the frame of the positions [N, 3]; `side`, the longer one, and `focal` are px.
     """
-    position, forward = camera_to_world[:, 3], -camera_to_world[:, 2]
+    position = camera_to_world[:, 3]
+    forward = -camera_to_world[:, 2]
     depths = (means - position) @ forward
     across = np.linalg.norm(means - position - depths[:, None] * forward, axis=1)
     middle = depths[across < 0.2 * depths]

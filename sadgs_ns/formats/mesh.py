@@ -49,8 +49,13 @@ class Fusion:
 
     def __init__(self, voxel_size: float) -> None:
         open3d = load_open3d()
-        self.voxel_size, self._views, self._core, self._image = voxel_size, 0, open3d.core, open3d.t.geometry.Image
-        names, types, shapes = ("tsdf", "weight", "color"), (open3d.core.float32,) * 3, ((1,), (1,), (3,))
+        self.voxel_size = voxel_size
+        self._views = 0
+        self._core = open3d.core
+        self._image = open3d.t.geometry.Image
+        names = ("tsdf", "weight", "color")
+        types = (open3d.core.float32,) * 3
+        shapes = ((1,), (1,), (3,))
         self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
 
     def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]] | None:
@@ -132,9 +137,11 @@ def load_open3d() -> Any:
 def write(file: IO[bytes], mesh: TriangleMesh) -> None:
     """Write a mesh as binary little-endian PLY, with colours. Open3D's own writer takes a full disk for success."""
     vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
-    vertices["position"], vertices["color"] = mesh.vertices, np.rint(255 * np.asarray(mesh.vertex_colors).clip(0, 1))
+    vertices["position"] = mesh.vertices
+    vertices["color"] = np.rint(255 * np.asarray(mesh.vertex_colors).clip(0, 1))
     faces = np.empty(len(mesh.triangles), [("corners", "u1"), ("indices", "<i4", 3)])
-    faces["corners"], faces["indices"] = 3, mesh.triangles
+    faces["corners"] = 3
+    faces["indices"] = mesh.triangles
     lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns: fused from rendered depth"]
     lines += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
     lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]

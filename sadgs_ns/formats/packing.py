@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 _BITS = 21  # Bits of each coordinate in a Morton code of 63 bits
-_LEVELS, _BINS, _SAMPLE, _ROUNDS = 256, 256, 1 << 18, 20
-"""Of a codebook: levels, as many as a byte tells apart; bins of the histogram from which it begins; values that it is
-made of; and rounds in which levels move to the means of their values."""
+_LEVELS = 256  # Levels of a codebook, as many as a byte tells apart
+_BINS = 256  # Bins of the histogram from which a codebook begins
+_SAMPLE = 1 << 18  # Values that a codebook is made of
+_ROUNDS = 20  # Rounds in which a codebook's levels move to the means of their values
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the order [N] of positions [N, 3] along a curve that keeps neighbours together."""
-    low, high = means.min(axis=0), means.max(axis=0)
+    low = means.min(axis=0)
+    high = means.max(axis=0)
     cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
     coordinates = (cells * ((1 << _BITS) - 1)).astype(np.int64).T  # [3, N]
     codes = np.zeros(len(means), np.int64)

@@ -23,7 +23,8 @@ from sadgs_ns.formats.packing import codebook, morton_order, nearest_level, sigm
 
 _PALETTE = 1 << 16  # Most sets of higher harmonics
 _SETS_A_ROW = 64  # Sets of harmonics in a row of their image
-_SAMPLE, _ROUNDS = 1 << 16, 8  # Sets from which the coarse clusters are made, and rounds of k-means
+_SAMPLE = 1 << 16  # Sets of harmonics from which the coarse clusters are made
+_ROUNDS = 8  # Rounds of k-means
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
@@ -32,11 +33,13 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     count = len(gaussians)
     width = 4 * math.ceil(math.sqrt(count) / 4)
     logs = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
-    low, high = logs.min(axis=0), logs.max(axis=0)
+    low = logs.min(axis=0)
+    high = logs.max(axis=0)
     positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
     largest, others = smallest_three(gaussians.quats)
     rotations = np.c_[to_bytes(255 * (others * math.sqrt(0.5) + 0.5)), (252 + largest).astype(np.uint8)]
-    scales, colors = codebook(gaussians.scales), codebook(gaussians.features_dc)
+    scales = codebook(gaussians.scales)
+    colors = codebook(gaussians.features_dc)
     alphas = to_bytes(255 * sigmoid(gaussians.opacities))
     images = {
         "means_l": (positions & 255).astype(np.uint8),
@@ -95,7 +98,9 @@ def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     sample = vectors if len(vectors) <= _SAMPLE else vectors[generator.choice(len(vectors), _SAMPLE, replace=False)]
     coarse = _k_means(sample, math.isqrt(number), generator)
     belongs = np.concatenate([_nearest(part, coarse) for part in np.array_split(vectors, len(vectors) // _SAMPLE + 1)])
-    centers, labels, used = [], np.empty(len(vectors), np.int64), 0
+    centers = []
+    labels = np.empty(len(vectors), np.int64)
+    used = 0
     for cluster in range(len(coarse)):
         members = (belongs == cluster).nonzero()[0]
         if len(members):

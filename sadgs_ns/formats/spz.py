@@ -23,8 +23,10 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.formats.gaussians import Context, Gaussians
 from sadgs_ns.formats.packing import sigmoid, smallest_three, to_bytes
 
-_MAGIC, _VERSION = 0x5053474E, 3
-_MOST_BITS, _LEAST_BITS = 20, 8  # Binary places of positions; the least are steps of 1/256 of a unit
+_MAGIC = 0x5053474E
+_VERSION = 3
+_MOST_BITS = 20  # Most binary places of positions
+_LEAST_BITS = 8  # Fewest binary places of positions: steps of 1/256 of a unit
 _RANGE = 1 << 23
 _COLOR = 0.15 * 255  # Steps in a unit of the harmonic of degree 0
 _AXES = struct.pack("<III", 0xADBE0003, 4, 6)  # Type, length, and axes right, down and forward, as of a PLY

@@ -95,24 +95,29 @@ def _near(positions: Tensor, starts: Tensor, ends: Tensor, reach: float) -> tupl
     """
     corner = starts.amin(dim=0) - reach
     side = float((starts.amax(dim=0) + reach - corner).max())
-    smallest, halves = max(reach, side / _CUBES), torch.tensor([-0.5, 0.5], device=starts.device)
-    middles, paths = (corner + side / 2).expand_as(starts), torch.arange(len(starts), device=starts.device)
+    smallest = max(reach, side / _CUBES)
+    halves = torch.tensor([-0.5, 0.5], device=starts.device)
+    middles = (corner + side / 2).expand_as(starts)
+    paths = torch.arange(len(starts), device=starts.device)
     while side > smallest and len(paths) <= _PAIRS // 4:
         side /= 2
         middles = (middles[:, None] + side * torch.cartesian_prod(halves, halves, halves)).view(-1, 3)
         paths = paths.repeat_interleave(8)
         near = _distances(middles, starts[paths], ends[paths]) <= reach + side  # But for rounding, √3/2 of it would do.
-        middles, paths = middles[near], paths[near]
+        middles = middles[near]
+        paths = paths[near]
     cubes = ((torch.cat([middles, positions]) - corner) / side).nan_to_num(-1.0).clamp(-1, _CUBES).floor().long()
     cubes = (cubes[:, 0] * (_CUBES + 2) + cubes[:, 1]) * (_CUBES + 2) + cubes[:, 2]
-    (listed, order), places = cubes[: len(paths)].sort(), cubes[len(paths) :]
+    (listed, order) = cubes[: len(paths)].sort()
+    places = cubes[len(paths) :]
     firsts = torch.searchsorted(listed, places)
     return torch.searchsorted(listed, places, right=True) - firsts, firsts, paths[order]
 
 
 def _distances(positions: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
     """Distances of positions from straight paths, all [K, 3]. [K]"""
-    ways, away = ends - starts, positions - starts
+    ways = ends - starts
+    away = positions - starts
     squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
     along = ((away * ways).sum(dim=1) / squares).clamp(0, 1)
     return torch.addcmul(away, along[:, None], ways, value=-1).norm(dim=1)

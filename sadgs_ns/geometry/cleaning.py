@@ -2,50 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from sadgs_ns.errors import InputError
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
 
-_SEEN = 1 / 255  # A view sees a Gaussian that makes up at least this part of a pixel, the least that is drawn
+_SEEN = 1 / 255
+"""A view sees a Gaussian that makes up at least this part of a pixel, the least that is drawn."""
 
 
 @dataclass(frozen=True)
 class Cleaning:
     """Which Gaussians are taken away; by default none."""
 
-    min_views: int = 0  # Take away Gaussians that fewer training views see; 0 takes none
+    min_views: int = 0
+    """Take away Gaussians that fewer training views see; 0 takes none."""
     max_extent: float | None = None
-    """Take away Gaussians whose longest standard deviation is more than this, in world units; None takes none."""
+    """Take away Gaussians whose longest standard deviation is more than this, in world units, > 0; None takes none."""
     crop: tuple[float, ...] | None = None
     """Take away Gaussians whose centre is outside this box: lowest x, y and z, then highest, in world units."""
     dust: float = 0.0
-    """Take away Gaussians that make up less than this, in pixels, of the image of every training view; 0 takes none."""
-
-    def __post_init__(self) -> None:
-        """Raise InputError if a number is negative or not finite, an extent is 0, or the box's corners are reversed."""
-        for name, value in (("--min-views", self.min_views), ("--dust", self.dust)):
-            if not 0 <= value < math.inf:
-                raise InputError(f"{name} {value:g} must be 0, which takes nothing away, or more.")
-        if self.max_extent is not None and not 0 < self.max_extent < math.inf:
-            raise InputError(
-                f"--max-extent {self.max_extent:g} must be more than 0: leave it out to take nothing away."
-            )
-        if self.crop is not None and not all(
-            -math.inf < low < high < math.inf for low, high in zip(self.crop[:3], self.crop[3:], strict=True)
-        ):
-            box = " ".join(f"{value:g}" for value in self.crop)
-            raise InputError(f"--crop {box} is no box: give the lowest x, y and z, then the highest x, y and z.")
+    """Take away Gaussians that make up less than this, in px, of the image of every training view; 0 takes none."""
 
     @property
     def needs_views(self) -> bool:
-        """Whether `find_remaining` needs the `Visibility` of the Gaussians."""
+        """Whether `choose_remaining` needs the `Visibility` of the Gaussians."""
         return self.min_views > 0 or self.dust > 0
 
 
@@ -68,52 +53,85 @@ def measure_visibility(
         cameras: World-to-camera matrix [4, 4], intrinsics in px [3, 3], width and height in px of each view.
         drawing: How Gaussians are drawn; their colours do not matter.
     """
-    shapes = [params[name].detach() for name in ("means", "quats", "scales")]
-    opacities = params["opacities"].detach().flatten().sigmoid()
-    sound = torch.cat([*shapes, opacities[:, None]], dim=1).isfinite().all(dim=1)  # Others cannot be drawn.
-    means, quats, scales = (torch.where(sound[:, None], value, 0.0) for value in shapes)
-    scales, opacities = scales.exp(), torch.where(sound, opacities, 0.0)
-    views, pixels = means.new_zeros(len(means), dtype=torch.int64), means.new_zeros(len(means))
+    gaussians = _drawable_gaussians(params)
+    views = torch.zeros_like(gaussians.opacities, dtype=torch.int64)
+    pixels = torch.zeros_like(gaussians.opacities)
     number = 0
     for viewmat, K, width, height in cameras:
-        with torch.enable_grad():
-            # An image is a sum of colours times weights, so its derivative by a colour is the weight.
-            colors = torch.ones_like(means, requires_grad=True)
-            gaussians = Gaussians(means, quats, scales, opacities, colors)
-            image, _, _ = rasterize(gaussians, Cameras(viewmat[None], K[None], width, height), drawing)
-            (weights,) = torch.autograd.grad(image.sum(), colors)
-        views += weights[:, 0] >= _SEEN
-        pixels = torch.maximum(pixels, weights[:, 0])
+        camera = Cameras(viewmat[None], K[None], width, height)
+        weights = _drawn_pixels(gaussians, camera, drawing)
+        views += weights >= _SEEN
+        pixels = torch.maximum(pixels, weights)
         number += 1
     return Visibility(views, pixels, number)
 
 
-@torch.no_grad()
-def find_remaining(
-    params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None
-) -> tuple[Tensor, list[str]]:
-    """Find which Gaussians stay. `seen` is needed if `cleaning.needs_views`.
+def _drawable_gaussians(params: Mapping[str, Tensor]) -> Gaussians:
+    """Return N white Gaussians; those with a value that is not finite, which cannot be drawn, have an opacity of 0."""
+    means = params["means"].detach()
+    quats = params["quats"].detach()
+    log_scales = params["scales"].detach()
+    opacities = params["opacities"].detach().flatten().sigmoid()
+    values = torch.cat([means, quats, log_scales, opacities[:, None]], dim=1)
+    sound = values.isfinite().all(dim=1)  # [N]
+    means = torch.where(sound[:, None], means, 0.0)
+    quats = torch.where(sound[:, None], quats, 0.0)
+    log_scales = torch.where(sound[:, None], log_scales, 0.0)
+    opacities = torch.where(sound, opacities, 0.0)
+    return Gaussians(means, quats, log_scales.exp(), opacities, torch.ones_like(means))
 
-    Returns:
-        Which stay, bool [N]; and for each option that is set a sentence, with how many it takes of what is left.
+
+def _drawn_pixels(gaussians: Gaussians, camera: Cameras, drawing: RenderOptions) -> Tensor:
+    """Measure how many pixels each of N Gaussians makes up in the image of one camera. [N]
+
+    An image is a sum of colours times weights, so its derivative by a colour is the weight.
     """
-    means, extents = params["means"].detach(), params["scales"].detach().amax(dim=1).exp()
-    goes: list[tuple[Tensor, str]] = []
+    with torch.enable_grad():
+        colors = torch.ones_like(gaussians.means, requires_grad=True)
+        image, _, _ = rasterize(gaussians._replace(colors=colors), camera, drawing)
+        (weights,) = torch.autograd.grad(image.sum(), colors)
+    return weights[:, 0]
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """The Gaussians that a cleaning leaves of N."""
+
+    stays: Tensor  # Which Gaussians stay. bool [N]
+    num_removed: dict[str, int]
+    """How many each option that is set takes of what those before it left, by the names of `Cleaning`'s fields."""
+    num_views: int  # Number of training views that were asked; 0 if none had to be
+
+
+@torch.no_grad()
+def choose_remaining(params: Mapping[str, Tensor], cleaning: Cleaning, seen: Visibility | None = None) -> Remaining:
+    """Find which Gaussians stay, one option of the cleaning after the other.
+
+    Args:
+        params: `means` and log `scales`.
+        cleaning: What is taken away.
+        seen: What training views see of the Gaussians. It is needed if `cleaning.needs_views`.
+    """
+    means = params["means"].detach()
+    extents = params["scales"].detach().amax(dim=1).exp()  # Longest standard deviations. [N]
+    goes: dict[str, Tensor] = {}  # What each option would take of all Gaussians, in the order of the options
     if cleaning.crop is not None:
         low, high = means.new_tensor(cleaning.crop).view(2, 3)
-        goes.append((~((means >= low) & (means <= high)).all(dim=1), "outside the box"))
+        is_inside = (means >= low) & (means <= high)  # [N, 3]
+        goes["crop"] = ~is_inside.all(dim=1)
     if cleaning.max_extent is not None:
-        goes.append((extents > cleaning.max_extent, f"longer than {cleaning.max_extent:g}"))
+        goes["max_extent"] = extents > cleaning.max_extent
+    num_views = 0
     if cleaning.needs_views:
         assert seen is not None
-        few = f"seen by fewer than {cleaning.min_views} of {seen.total} training views"
-        dust = f"of less than {cleaning.dust:g} px in every training view"
-        goes += [(seen.views < cleaning.min_views, few)] if cleaning.min_views else []
-        goes += [(seen.pixels < cleaning.dust, dust)] if cleaning.dust else []
-    stays, sentences = torch.ones(len(means), dtype=torch.bool, device=means.device), []
-    for taken, which in goes:
-        number = int((stays & taken).sum())
+        num_views = seen.total
+        if cleaning.min_views > 0:
+            goes["min_views"] = seen.views < cleaning.min_views
+        if cleaning.dust > 0:
+            goes["dust"] = seen.pixels < cleaning.dust
+    stays = torch.ones(len(means), dtype=torch.bool, device=means.device)
+    num_removed = {}
+    for option, taken in goes.items():
+        num_removed[option] = int((stays & taken).sum())
         stays &= ~taken
-        noun, verb = ("Gaussian", "is") if number == 1 else ("Gaussians", "are")
-        sentences.append(f"{number:,} {noun} {which} {verb} taken away.")
-    return stays, sentences
+    return Remaining(stays, num_removed, num_views)

@@ -61,8 +61,10 @@ def dense_points(
     noise = torch.rand(len(means), generator=generator, device=device).clamp(1e-12, 1 - 1e-7)
     keys = weights.log() - (-noise.log()).log()
     drawn = keys.topk(min(len(means), _DRAWN * number)).indices
-    means, scales = means[drawn], scales[drawn]
-    agreeing, colors = torch.zeros(len(means), device=device), torch.zeros_like(means)
+    means = means[drawn]
+    scales = scales[drawn]
+    agreeing = torch.zeros(len(means), device=device)
+    colors = torch.zeros_like(means)
     for i, (m, viewmat) in enumerate(views):
         depths, places = _places(means, viewmat, m)  # [Q], [Q, 2]
         inside = (depths > 0) & ((places >= 0) & (places < 1)).all(dim=1)
@@ -87,7 +89,8 @@ def _candidates(depths: DepthMap, viewmat: Tensor, wavelength: Tensor) -> tuple[
     reduced = width / wavelength.shape[1]
     local = reduced * _read(wavelength.to(pixels)[..., None], pixels / size)[:, 0]  # Λ in px of the depth map
     known = local.isfinite()
-    local, depth = local[known].clamp_min(1.0), depths.depth[rows, columns][known]
+    local = local[known].clamp_min(1.0)
+    depth = depths.depth[rows, columns][known]
     rays = (pixels[known] - depths.K[:2, 2]) / depths.K.diagonal()[:2]
     in_camera = torch.cat([rays * depth[:, None], depth[:, None]], dim=1)
     return (in_camera - viewmat[:3, 3]) @ viewmat[:3, :3], local**-2, SCALE * local * depth / depths.K[0, 0]

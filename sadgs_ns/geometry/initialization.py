@@ -25,7 +25,8 @@ def bounding_box_points(points: Tensor, grid: int = FACE_GRID) -> tuple[Tensor, 
         6·grid² points [6·grid², 3], and the spacing that their scale starts from, mean box extent / grid, world units.
         Where the box is flat, faces coincide and every place has one point; a box without extent has no points.
     """
-    low, high = points.amin(0), points.amax(0)
+    low = points.amin(0)
+    high = points.amax(0)
     if (low == high).all():
         return points[:0], 1.0
     ticks = (torch.arange(grid, device=points.device, dtype=points.dtype) + 0.5) / grid  # cell centres in (0, 1)
@@ -74,7 +75,8 @@ def starting_points(
     `faces` adds `bounding_box_points` to the given points with their colours in [0, 1]. Return points and colours,
     [N, 3] each, and scales in world units, > 0, and opacities, [N] each.
     """
-    scales, opacities = neighbour_scales(points), torch.full((len(points),), opacity)
+    scales = neighbour_scales(points)
+    opacities = torch.full((len(points),), opacity)
     if not faces:
         return points, colors, scales, opacities
     added, spacing = bounding_box_points(points)

@@ -33,7 +33,8 @@ def scene_near_plane(
 
     The training camera whose `NEAREST_POINTS`-th nearest SfM point has the least depth decides.
     """
-    points, nearest = points[plausible_points(points)], math.inf
+    points = points[plausible_points(points)]
+    nearest = math.inf
     if len(points) >= NEAREST_POINTS:
         points = points[:: -(-len(points) // _MOST_POINTS)]  # [P, 3]
         cameras = (tensor.split(max(_PAIRS // len(points), 1)) for tensor in (viewmats, Ks, sizes))
@@ -47,7 +48,9 @@ def depths_in_views(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor)
 
     `sizes` are the images' widths and heights in px [C, 2]. [C, P]
     """
-    viewmats, Ks, sizes = viewmats.to(points), Ks.to(points), sizes.to(points)
+    viewmats = viewmats.to(points)
+    Ks = Ks.to(points)
+    sizes = sizes.to(points)
     projected = (Ks @ viewmats[:, :3, :3]) @ points.T + Ks @ viewmats[:, :3, 3:]  # [C, 3, P]
     x, y, depths = projected.unbind(dim=1)
     inside = (x >= 0) & (x <= sizes[:, :1] * depths) & (y >= 0) & (y <= sizes[:, 1:] * depths) & (depths > 0)

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 REACH = 30.0
 """A position this many times as far out as most others is an outlier. In the captures on which this was tried, the
 farthest SfM point is 2 to 9 times as far out as 99 % of them, the farthest camera at most 1.4 times as 90 %."""
-POINT_SHARE, CAMERA_SHARE = 0.99, 0.9  # Shares of the SfM points and cameras that tell how far out one usually lies
+POINT_SHARE = 0.99  # Share of the SfM points that tells how far out one usually lies
+CAMERA_SHARE = 0.9  # The same of cameras
 
 
 def far_outliers(positions: NDArray[np.floating], share: float) -> NDArray[np.bool_]:

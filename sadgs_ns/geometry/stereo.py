@@ -87,17 +87,21 @@ def depth_maps(
     Returns:
         A map for each view, whose longest side is at most WORKING_SIDE px; empty if it has no usable neighbour.
     """
-    count, device = len(viewmats), torch.device(device)
+    count = len(viewmats)
+    device = torch.device(device)
     masks = [None] * count if masks is None else masks
     # In float64, since positions may be far from the origin, and on the host, which needs the numbers.
-    viewmats, Ks = viewmats.to("cpu", torch.float64), Ks.to("cpu", torch.float64, copy=True)
-    pyramids, sizes = [], torch.zeros((count, 2), dtype=torch.float64)
+    viewmats = viewmats.to("cpu", torch.float64)
+    Ks = Ks.to("cpu", torch.float64, copy=True)
+    pyramids = []
+    sizes = torch.zeros((count, 2), dtype=torch.float64)
     for v in range(count):
         image = images(v)
         pyramids.append(_pyramid(image, masks[v], device))
         sizes[v] = torch.tensor(pyramids[v][0].shape[:0:-1])
         Ks[v, :2] *= (sizes[v] / torch.tensor([image.shape[1], image.shape[0]]))[:, None]
-    views, placed = _views(pyramids, viewmats, Ks, sizes, points.to(device)), Ks.to(device, torch.float32)
+    views = _views(pyramids, viewmats, Ks, sizes, points.to(device))
+    placed = Ks.to(device, torch.float32)
     solved = [_solve(view, views) for view in views]
     maps = []
     for view, K, (inverse, score) in zip(views, placed, solved, strict=True):
@@ -151,9 +155,11 @@ def _pyramid(image: Tensor, mask: Tensor | None, device: torch.device) -> list[T
     """Reduce an image [H, W, 3 or 4] and its mask, bool [H, W], to `_View.levels`."""
     scale = 1 / 255 if image.dtype == torch.uint8 else 1.0
     image = image.to(device).to(torch.float32) * scale
-    grey, valid = image[..., :3].mean(dim=2), image.new_ones(image.shape[:2], dtype=torch.bool)  # [H, W]
+    grey = image[..., :3].mean(dim=2)  # [H, W]
+    valid = image.new_ones(image.shape[:2], dtype=torch.bool)  # [H, W]
     if image.shape[2] == 4:
-        grey, valid = grey * image[..., 3], image[..., 3] >= 0.5
+        grey = grey * image[..., 3]
+        valid = image[..., 3] >= 0.5
     if mask is not None:
         valid = valid & mask.to(device)
     # Grey values lie around 0, so that float32 loses little in their moments.
@@ -189,11 +195,13 @@ def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Te
     cameras[:, :2, :3] = Ks[:, :2] * (2 / sizes[:, :, None])
     cameras[:, :2, 2] -= 1
     projections = cameras @ viewmats  # [V, 4, 4]
-    inverses, centres = projections.inverse(), viewmats.inverse()[:, :3, 3]
+    inverses = projections.inverse()
+    centres = viewmats.inverse()[:, :3, 3]
     views = []
     for v, levels in enumerate(pyramids):
         near = [n for n in neighbours[v] if n >= 0]
-        to, back = projections[near] @ inverses[v], projections[v] @ inverses[near]  # [N, 4, 4]
+        to = projections[near] @ inverses[v]  # [N, 4, 4]
+        back = projections[v] @ inverses[near]  # [N, 4, 4]
         to, back = (matrices[:, :3].to(points.device, torch.float32) for matrices in (to, back))
         inverse = 0.5 / ranges[v][1], 1.5 / ranges[v][0]  # Surfaces without points may lie nearer and farther.
         motions = Ks[near, 0, 0] * (centres[near] - centres[v]).norm(dim=1)  # px per inverse depth. [N]
@@ -245,7 +253,8 @@ def _correlation(image: Tensor, neighbour: Tensor, matrix: Tensor, inverse: Tens
     """
     places = _project(matrix, *_pixels(image), inverse)[0].movedim(0, -1)  # [D, h, w, 2]
     sampled = F.grid_sample(neighbour.expand(len(places), -1, -1, -1), places, align_corners=False)  # [D, 2, h, w]
-    value, other = image[0], sampled[:, 0]
+    value = image[0]
+    other = sampled[:, 0]
     # The weight, both values and their products share two passes of the box filter.
     moments = sampled.new_empty((6, *other.shape))
     weight = torch.mul(image[1], sampled[:, 1] > 0.999, out=moments[0])
@@ -285,7 +294,8 @@ def _project(matrix: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Ten
 def _peak(scores: Tensor) -> tuple[Tensor, Tensor]:
     """Index of the best score among [D, h, w], refined by the parabola through it and those beside; and the score."""
     score, index = scores.max(dim=0, keepdim=True)
-    before, after = scores.gather(0, (index - 1).clamp_min(0)), scores.gather(0, (index + 1).clamp_max(len(scores) - 1))
+    before = scores.gather(0, (index - 1).clamp_min(0))
+    after = scores.gather(0, (index + 1).clamp_max(len(scores) - 1))
     offset = 0.5 * (after - before) / (2 * score - before - after).clamp_min(_TINY)
     offset = torch.where((index > 0) & (index < len(scores) - 1), offset, 0.0)
     return (index + offset)[0], score[0]
@@ -300,7 +310,8 @@ def _confidence(view: _View, inverse: Tensor, score: Tensor, others: list[Tensor
         # The nearest pixel's depth is read, since a mean of two surfaces is none.
         found = F.grid_sample(other[None, None], places.movedim(0, -1), mode="nearest", align_corners=False)[0]
         returned, _ = _project(back, places[0, 0], places[1, 0], found)
-        x_error, y_error = (returned[0] - x) * (0.5 * x.numel()), (returned[1] - y) * (0.5 * y.numel())  # px. [1, h, w]
+        x_error = (returned[0] - x) * (0.5 * x.numel())  # px. [1, h, w]
+        y_error = (returned[1] - y) * (0.5 * y.numel())  # px. [1, h, w]
         near = torch.hypot(x_error, y_error) < PIXEL_TOLERANCE
         agreeing += (near & ((found * depth / inverse - 1).abs() < DEPTH_TOLERANCE))[0]
     most = min(len(others), AGREEING)

@@ -12,10 +12,10 @@ _BLOCK = 1024  # Numbers that one program updates
 
 
 @triton.jit
-def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX: tl.constexpr):
+def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, exists, MAX: tl.constexpr):
     """New moments of a block, and the change of its parameters; notes a gradient that must be left out."""
     usable = tl.abs(g) < MAX  # NaN compares as false
-    tl.store(noted + i * 0, float("nan"), exists & ~usable)
+    tl.store(nonfinite_flag + i * 0, float("nan"), exists & ~usable)
     g = tl.where(usable, g, 0.0)
     m = beta1 * m + (1 - beta1) * g
     v = beta2 * v + (1 - beta2) * g * g
@@ -24,7 +24,7 @@ def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists,
 
 @triton.jit(do_not_specialize=["rows"])
 def _update(
-    parameters, gradients, means, squares, rates, scales, noted, overflowed, rows, beta1, beta2, eps,
+    parameters, gradients, means, squares, rates, scales, nonfinite_flag, overflowed, rows, beta1, beta2, eps,
     WIDTHS: tl.constexpr, FLAGS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Update a block of one of the parameters, which together are covered by the grid, unless all flags are set.
@@ -49,14 +49,14 @@ def _update(
     i = block * BLOCK + tl.arange(0, BLOCK)
     if (block + 1) * BLOCK <= n:  # the block is whole: without a mask, memory is read in wide words
         g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
-        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, i < n, MAX)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, i < n, MAX)
         tl.store(mean + i, m)
         tl.store(square + i, v)
         tl.store(parameter + i, tl.load(parameter + i) - change)
     else:
         exists = i < n
         g, m, v = tl.load(gradient + i, exists), tl.load(mean + i, exists), tl.load(square + i, exists)
-        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, noted, i, exists, MAX)
+        m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, exists, MAX)
         tl.store(mean + i, m, exists)
         tl.store(square + i, v, exists)
         tl.store(parameter + i, tl.load(parameter + i, exists) - change, exists)
@@ -70,7 +70,7 @@ def rate_and_scale(step: int, lr: float, betas: tuple[float, float]) -> tuple[fl
 def adam_step(
     parameters: tuple[Tensor, ...], gradients: tuple[Tensor, ...],
     exp_avgs: tuple[Tensor, ...], exp_avg_sqs: tuple[Tensor, ...],
-    factors: Tensor, noted: Tensor, overflowed: tuple[Tensor, ...] = (),
+    factors: Tensor, nonfinite_flag: Tensor, overflowed: tuple[Tensor, ...] = (),
     *, betas: tuple[float, float], eps: float, max_gradient: float,
 ) -> None:  # fmt: skip
     """Update P parameters and their moments in place, in one launch, as torch's Adam without weight decay.
@@ -81,7 +81,7 @@ def adam_step(
         parameters: Contiguous float32; so are the gradients and both moments, of the same shapes. [N, ...] each
         factors: The results of `rate_and_scale`, on the device, so that a CUDA graph can repeat the launch.
             Contiguous float32 [2, P]
-        noted: Becomes NaN if there was such a gradient. float32 [1]
+        nonfinite_flag: Becomes NaN if there was such a gradient. float32 [1]
         overflowed: Flags; if there are some and none is 0, nothing is changed. int64 [1] each
     """
     rows = parameters[0].shape[:1].numel()  # 1 without dimensions
@@ -89,6 +89,7 @@ def adam_step(
     rates, scales = (row.unbind() for row in factors)
     grid = (sum(cdiv(rows * width, _BLOCK) for width in widths),)
     _update[grid](
-        parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales, noted, overflowed or (noted,), rows, *betas, eps,
+        parameters, gradients, exp_avgs, exp_avg_sqs, rates, scales,
+        nonfinite_flag, overflowed or (nonfinite_flag,), rows, *betas, eps,
         widths, len(overflowed), max_gradient, _BLOCK,
     )  # fmt: skip

@@ -23,14 +23,17 @@ def principal_eigenvalue(
 ) -> Tensor:
     """Larger eigenvalue λ_1 of symmetric 2×2 tensors (xx, xy, yy), in a closed form in which nothing cancels. [...]"""
     xx, xy, yy = structure_tensor.unbind(-1)
-    return 0.5 * (xx + yy) + torch.hypot(0.5 * (xx - yy), xy)
+    mean = 0.5 * (xx + yy)
+    deviator = 0.5 * (xx - yy)
+    return mean + torch.hypot(deviator, xy)
 
 
 def wavelength(
     structure_tensor: Tensor,  # [..., 3]
 ) -> Tensor:
     """Smallest local wavelength Λ_min = 1 / (√λ_1 + ε) in px of S̄ in 1/px², in (0, 1/ε] (paper, section 3.3). [...]"""
-    return 1.0 / (principal_eigenvalue(structure_tensor).clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
+    frequency = principal_eigenvalue(structure_tensor).clamp_min(0).sqrt()  # 1/px
+    return 1.0 / (frequency + WAVELENGTH_EPSILON)
 
 
 def projected_axes(
@@ -47,15 +50,35 @@ def projected_axes(
     J is the Jacobian that gsplat's forward pass uses for a pinhole camera, with its clamp near the frustum's border.
     """
     rotation = viewmats[:, :3, :3]  # W [M, 3, 3]
-    x, y, z = (torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]).unbind(-1)  # [M] each
-    fx, fy, cx, cy = Ks[:, 0, 0], Ks[:, 1, 1], Ks[:, 0, 2], Ks[:, 1, 2]
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    tangent_x = torch.maximum(torch.minimum(x / z, (width - cx) / fx + margin_x), -cx / fx - margin_x)
-    tangent_y = torch.maximum(torch.minimum(y / z, (height - cy) / fy + margin_y), -cy / fy - margin_y)
-    zero, jxx, jyy = torch.zeros_like(z), fx / z, fy / z  # never z², which underflows long before z does
-    jacobian = torch.stack([jxx, zero, -jxx * tangent_x, zero, jyy, -jyy * tangent_y], -1).view(-1, 2, 3)
-    axes = normalized_quat_to_rotmat(F.normalize(quats, dim=-1)) * scales[:, None, :]  # R S [M, 3, 3]
-    return (jacobian @ rotation @ axes).transpose(1, 2)
+    centres = torch.einsum("mij,mj->mi", rotation, means) + viewmats[:, :3, 3]  # In camera space. [M, 3]
+    jacobian = _clamped_jacobian(centres, Ks, width, height)  # J [M, 2, 3]
+    rotmats = normalized_quat_to_rotmat(F.normalize(quats, dim=-1))  # R [M, 3, 3]
+    axes = rotmats * scales[:, None, :]  # R S [M, 3, 3]
+    projected = jacobian @ rotation @ axes  # J W R S [M, 2, 3]
+    return projected.transpose(1, 2)
+
+
+def _clamped_jacobian(centres: Tensor, Ks: Tensor, width: int, height: int) -> Tensor:
+    """Jacobian of the pinhole projection at centres in camera space [M, 3], as gsplat computes it. [M, 2, 3]"""
+    x, y, z = centres.unbind(-1)  # [M] each
+    fx = Ks[:, 0, 0]
+    fy = Ks[:, 1, 1]
+    cx = Ks[:, 0, 2]
+    cy = Ks[:, 1, 2]
+    margin_x = FRUSTUM_MARGIN * 0.5 * width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * height / fy
+    right = (width - cx) / fx + margin_x
+    left = -cx / fx - margin_x
+    bottom = (height - cy) / fy + margin_y
+    top = -cy / fy - margin_y
+    tangent_x = torch.maximum(torch.minimum(x / z, right), left)
+    tangent_y = torch.maximum(torch.minimum(y / z, bottom), top)
+    zero = torch.zeros_like(z)
+    jxx = fx / z  # There is no z² in J, because it underflows long before z does.
+    jyy = fy / z
+    row_x = torch.stack([jxx, zero, -jxx * tangent_x], dim=-1)  # [M, 3]
+    row_y = torch.stack([zero, jyy, -jyy * tangent_y], dim=-1)
+    return torch.stack([row_x, row_y], dim=1)
 
 
 def sample_footprint(
@@ -63,31 +86,46 @@ def sample_footprint(
     conics: Tensor,  # [M, 3] (a, b, c) of the inverse of Σ2D + SCREEN_BLUR·I, in 1/px²
     jitter: Tensor,  # [M, 2] in [0, 1)
 ) -> Tensor:
-    """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform.
+    """Draw one point in each Gaussian's footprint, uniformly if the jitter is uniform (paper, section 3.3).
 
     The footprint is the 2σ ellipse of Σ2D: a uniform point in it has mean μ_2D and covariance Σ2D. gsplat's conic
-    contains its screen-space blur, which is taken out again; variances that rounding makes negative are set to 0. A
-    float32 conic tells its determinant from 0 only above ε a c: footprints of thousands of px are cut to that.
+    contains its screen-space blur, which is taken out again; variances that rounding makes negative are set to 0.
 
     Returns:
         Points in px, pixel centres at half-integers; NaN where the conic is NaN or infinite. [M, 2]
     """
-    a, b, c = conics.double().unbind(-1)  # the determinant of a long thin Gaussian cancels in float32
-    determinant = a * c - b * b  # of float32 numbers it cannot overflow: it is finite where they are
-    known = torch.maximum(determinant, torch.finfo(conics.dtype).eps * a * c)
+    xx, xy, yy = _footprint_covariances(conics)
+    # Cholesky factor of Σ2D, with xy limited to what a positive semidefinite matrix allows.
+    factor_xx = xx.sqrt()
+    limit = yy.sqrt()
+    factor_xy = torch.where(xx > 0, xy / factor_xx, 0.0)
+    factor_xy = torch.maximum(torch.minimum(factor_xy, limit), -limit)
+    factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
+    # A uniform point in the disc of radius 2.
+    radius = 2.0 * jitter[:, 0].sqrt()
+    angle = 2.0 * torch.pi * jitter[:, 1]
+    u = radius * angle.cos()
+    v = radius * angle.sin()
+    offsets = torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], dim=-1)  # [M, 2]
+    return means2d + offsets.to(means2d.dtype)
+
+
+def _footprint_covariances(conics: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return xx, xy and yy of Σ2D in px², given `conics` as `sample_footprint` takes them. Each float64 [M]
+
+    A float32 conic tells its determinant from 0 only above ε a c: footprints of thousands of px are cut to that.
+    """
+    a, b, c = conics.double().unbind(-1)  # The determinant of a long thin Gaussian cancels in float32.
+    determinant = a * c - b * b  # Of float32 numbers it cannot overflow: it is finite where they are.
+    least = torch.finfo(conics.dtype).eps * a * c
+    known = torch.maximum(determinant, least)
     # The conic of a Gaussian too large for float32 is 0.
-    determinant = torch.where(determinant.isfinite(), known.clamp_min(torch.finfo(known.dtype).tiny), torch.nan)
+    known = known.clamp_min(torch.finfo(known.dtype).tiny)
+    determinant = torch.where(determinant.isfinite(), known, torch.nan)
     xx = (c / determinant - SCREEN_BLUR).clamp_min(0)
     yy = (a / determinant - SCREEN_BLUR).clamp_min(0)
     xy = -b / determinant
-    # Cholesky factor of Σ2D, with xy limited to what a positive semidefinite matrix allows.
-    factor_xx = xx.sqrt()
-    factor_xy = torch.where(xx > 0, xy / factor_xx, 0.0)
-    factor_xy = torch.maximum(torch.minimum(factor_xy, yy.sqrt()), -yy.sqrt())
-    factor_yy = (yy - factor_xy**2).clamp_min(0).sqrt()
-    radius, angle = 2.0 * jitter[:, 0].sqrt(), 2.0 * torch.pi * jitter[:, 1]
-    u, v = radius * angle.cos(), radius * angle.sin()
-    return means2d + torch.stack([factor_xx * u, factor_xy * u + factor_yy * v], -1).to(means2d.dtype)
+    return xx, xy, yy
 
 
 def sample_map(
@@ -100,8 +138,8 @@ def sample_map(
     `camera_ids` are the points' images. Points are in px, pixel centres at half-integers.
 
     Returns:
-        S̄ in float32 or wider [M, 3], and whether it is known [M]: the point lies inside the image, on a pixel whose S̄
-        is not NaN, as that of masked pixels is. Where it is not known, 0 is returned.
+        S̄ in 1/px², in float32 or wider [M, 3], and whether it is known, bool [M]: the point lies inside the image, on a
+        pixel whose S̄ is not NaN, as that of masked pixels is. Where it is not known, 0 is returned.
     """
     height, width = structure_tensors.shape[1:3]
     x, y = points.unbind(-1)
@@ -109,8 +147,10 @@ def sample_map(
     column = torch.where(inside, x, 0).long()
     row = torch.where(inside, y, 0).long()
     values = structure_tensors[camera_ids, row, column]
-    is_quantized = values.dtype == torch.uint8
-    values = dequantize(values) if is_quantized else values.to(torch.promote_types(values.dtype, torch.float32))
+    if values.dtype == torch.uint8:
+        values = dequantize(values)
+    else:
+        values = values.to(torch.promote_types(values.dtype, torch.float32))
     known = inside & ~values.isnan().any(dim=1)
     return torch.where(known[:, None], values, 0.0), known
 
@@ -120,4 +160,5 @@ def eta(
     structure_tensor: Tensor,  # [M, 3]
 ) -> Tensor:
     """η_k = ‖v_k‖ / Λ_min of each axis (paper, eq. 6), of results of `projected_axes` and `sample_map`. [M, 3]"""
-    return torch.hypot(axes[..., 0], axes[..., 1]) / wavelength(structure_tensor)[:, None]
+    lengths = torch.hypot(axes[..., 0], axes[..., 1])  # px
+    return lengths / wavelength(structure_tensor)[:, None]

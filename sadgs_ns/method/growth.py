@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +20,25 @@ from sadgs_ns.method.statistics import consistent
 
 SMALL_SCALE = 0.001
 """Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
-_OTHER_AXES = 0.8  # Factor on the other axes of a Gaussian whose longest axis is halved (docs/results.md)
+_OTHER_AXES = 0.8
+"""Factor on the other axes of a Gaussian whose longest axis is halved (docs/results.md)."""
+
+
+class Options(Protocol):
+    """The options that rules and the running strategy read; `StructureAwareStrategy` has and documents them."""
+
+    max_gaussians: int
+    tau_split: float
+    min_observations: int
+    split_min_opacity: float
+    child_scale: float
+    clone_grad2d: float
+    split_absgrad2d: float
+    absgs_long_axis: bool
+    min_opacity: float
+
+    def check(self) -> None:
+        """Raise ValueError if an option is out of its range."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +58,13 @@ class Proposal:
     def growth(self) -> Tensor:
         """Gaussians that each one would add. int64 [N]"""
         growth = num_children(self.children) - 1
-        return growth if self.clone is None else growth + self.clone
+        if self.clone is None:
+            return growth
+        return growth + self.clone
 
 
-Propose = Callable[[Any, Params, Mapping[str, Any]], Proposal]
-"""Takes a `StructureAwareStrategy`, for its options, the parameters and the strategy's state."""
+Propose = Callable[[Options, Params, Mapping[str, Any]], Proposal]
+"""Takes the options, the parameters and the strategy's state."""
 
 
 @dataclass(frozen=True)
@@ -59,30 +79,37 @@ class Rule:
     prunes by them before it grows, and empties the gradients, too; others prune the faint afterwards."""
 
 
-def structure_aware(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Split the axes on which η violated consistently, those of the largest η first (paper, section 3.5)."""
-    violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)
-    violates &= (opacities(params) >= options.split_min_opacity)[:, None]
+    violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)  # [N, 3]
+    is_opaque = opacities(params) >= options.split_min_opacity  # [N]
+    violates &= is_opaque[:, None]
     worst = torch.where(violates, state["eta_max"], 0.0).amax(dim=1)  # [N]
     counts = children_per_axis(state["eta_max"], violates)
-    return Proposal(counts, worst, partial(grid_split, child_scale=options.child_scale))
+    split_into_grid = partial(grid_split, child_scale=options.child_scale)
+    return Proposal(counts, worst, split_into_grid)
 
 
-def absgs(options: Any, params: Params, state: Mapping[str, Any]) -> Proposal:
+def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
     The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of
     two that are 1.6 times as small on all axes are drawn at random, as 3DGS does.
     """
-    scales, count = params["scales"].detach(), state["grad_count"].clamp_min(1)
+    scales = params["scales"].detach()
+    count = state["grad_count"].clamp_min(1)
     is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
     clone_ratio = state["grad2d"] / count / options.clone_grad2d
     split_ratio = state["absgrad2d"] / count / options.split_absgrad2d
-    steepness = torch.where(is_small, clone_ratio, split_ratio)  # ≥ 1 grows
-    grows = (steepness >= 1) & steepness.isfinite()  # a sum that overflowed says nothing
-    halved = F.one_hot(scales.argmax(dim=-1), 3) * (grows & ~is_small)[:, None]  # [N, 3]
-    how = _halve if options.absgs_long_axis else _split_at_random
-    return Proposal(1 + halved, steepness, how, clone=grows & is_small)
+    steepness = torch.where(is_small, clone_ratio, split_ratio)  # From 1 on a Gaussian grows. [N]
+    grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
+    is_split = grows & ~is_small
+    longest = F.one_hot(scales.argmax(dim=-1), 3)  # [N, 3]
+    halved = longest * is_split[:, None]
+    split_in_two = _split_at_random
+    if options.absgs_long_axis:
+        split_in_two = _halve
+    return Proposal(1 + halved, steepness, split_in_two, clone=grows & is_small)
 
 
 RULES: dict[str, Rule] = {
@@ -93,30 +120,44 @@ RULES: dict[str, Rule] = {
 
 
 def due_rule(iteration: int, windows: Windows) -> Rule | None:
-    """Return the rule whose step ends an iteration inside the densification window."""
-    return next((rule for rule in RULES.values() if due(iteration, rule.every(windows))), None)
+    """Return the rule whose step ends an iteration inside the densification window, or None."""
+    for rule in RULES.values():
+        if due(iteration, rule.every(windows)):
+            return rule
+    return None
 
 
 @torch.no_grad()
 def apply(proposal: Proposal, allowed: Tensor, params: Params, optimizers: Optimizers, state: State) -> None:
     """Let the `allowed` Gaussians, bool [N], grow as proposed, in place; new ones have empty rows in `state`."""
     counts = torch.where(allowed[:, None], proposal.children, 1)
-    if proposal.clone is not None and (num_clones := int((is_clone := allowed & proposal.clone).sum())) > 0:
-        duplicate(params, optimizers, state, is_clone)  # type: ignore[arg-type]
-        _forget_last(state, num_clones)
-        counts = F.pad(counts, (0, 0, 0, num_clones), value=1)  # clones are not split
+    if proposal.clone is not None:
+        num_clones = _clone(allowed & proposal.clone, params, optimizers, state)
+        counts = F.pad(counts, (0, 0, 0, num_clones), value=1)  # Clones are not split.
     if (counts > 1).any():
         proposal.split(params, optimizers, state, counts)
 
 
+def _clone(is_cloned: Tensor, params: Any, optimizers: Any, state: Any) -> int:
+    """Append a copy of some Gaussians, bool [N], with empty rows in `state`; return how many."""
+    num_clones = int(is_cloned.sum())
+    if num_clones > 0:
+        duplicate(params, optimizers, state, is_cloned)
+        _forget_last(state, num_clones)
+    return num_clones
+
+
 def _halve(params: Any, optimizers: Any, state: Any, counts: Tensor) -> None:
-    # The other axes are shortened on the parents, which the next line replaces by their children.
-    others = (counts > 1).any(dim=1, keepdim=True) & (counts == 1)
-    params["scales"].data += math.log(_OTHER_AXES) * others
+    """Halve Gaussians along the axes of two children, int64 [N, 3], and shorten their other axes."""
+    is_split = (counts > 1).any(dim=1, keepdim=True)
+    is_other = is_split & (counts == 1)
+    # The parents are shortened; then their children take their place.
+    params["scales"].data += math.log(_OTHER_AXES) * is_other
     grid_split(params, optimizers, state, counts)
 
 
 def _split_at_random(params: Any, optimizers: Any, state: Any, counts: Tensor) -> None:
+    """Split Gaussians of more than one child, counted in int64 [N, 3], in two smaller ones at random places."""
     is_split = (counts > 1).any(dim=1)
     split(params, optimizers, state, is_split)
     _forget_last(state, 2 * int(is_split.sum()))

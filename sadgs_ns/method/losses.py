@@ -20,7 +20,8 @@ L2_LAMBDA = 2.0
 @lru_cache(maxsize=8)
 def _window(device: torch.device, dtype: torch.dtype) -> Tensor:
     """SSIM's window on the device, for each channel [3, 1, 1, 11]. Copying it in every step would stop the host."""
-    return torch.tensor(WINDOW, dtype=dtype, device=device).repeat(3, 1, 1, 1)
+    weights = torch.tensor(WINDOW, dtype=dtype, device=device)
+    return weights.repeat(3, 1, 1, 1)
 
 
 def photometric_loss(
@@ -49,26 +50,47 @@ def photometric_loss(
         ValueError: From pytorch_msssim, if views are one pixel high or wide.
         InputError: If the views have more pixels than the Triton kernels can address (kernels/limits.py).
     """
-    suits = target.dtype in (torch.float32, torch.uint8) and min(predicted.shape[1:3]) >= len(WINDOW)
-    if suits and use_triton(predicted):
-        from sadgs_ns.kernels.losses import photometric_loss as fused_photometric_loss
+    has_suitable_type = target.dtype in (torch.float32, torch.uint8)
+    is_large_enough = min(predicted.shape[1:3]) >= len(WINDOW)
+    if has_suitable_type and is_large_enough and use_triton(predicted):
+        from sadgs_ns.kernels import losses as kernel
 
-        return fused_photometric_loss(
+        return kernel.photometric_loss(
             predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, parts=parts
         )
-    if target.dtype == torch.uint8:
-        target = target / 255.0
+    target = _as_floats(target)
     difference = predicted - target
-    l1, l2 = difference.abs().mean(), difference.square().mean()
-    # The copies are contiguous: with channels-last strides cuDNN convolves at a third of the speed, above all backward.
-    similarity = ssim(
-        predicted.permute(0, 3, 1, 2).contiguous(),
-        target.permute(0, 3, 1, 2).contiguous(),
-        data_range=1.0,
-        win=_window(predicted.device, predicted.dtype),
-    )
+    l1 = difference.abs().mean()
+    l2 = difference.square().mean()
+    similarity = _similarity(predicted, target)
     loss = (1 - ssim_lambda) * l1 + ssim_lambda * (1 - similarity) + l2_lambda * l2
-    return loss if parts is None else loss + parts.sum(), -10 * l2.detach().log10()
+    if parts is not None:
+        loss = loss + parts.sum()
+    psnr = -10 * l2.detach().log10()
+    return loss, psnr
+
+
+def _as_floats(
+    target: Tensor,  # [C, H, W, 3]
+) -> Tensor:
+    """Return an image in bytes as floats in [0, 1], and others as they are. [C, H, W, 3]"""
+    if target.dtype == torch.uint8:
+        return target / 255.0
+    return target
+
+
+def _similarity(
+    predicted: Tensor,  # [C, H, W, 3]
+    target: Tensor,  # [C, H, W, 3]
+) -> Tensor:
+    """Mean SSIM of views in [0, 1], a scalar.
+
+    The copies are contiguous: with channels-last strides cuDNN convolves at a third of the speed, above all backward.
+    """
+    window = _window(predicted.device, predicted.dtype)
+    x = predicted.permute(0, 3, 1, 2).contiguous()
+    y = target.permute(0, 3, 1, 2).contiguous()
+    return ssim(x, y, data_range=1.0, win=window)
 
 
 def photometric_part(
@@ -98,14 +120,19 @@ def photometric_part(
     if last - first == height:
         loss, psnr = photometric_loss(predicted, target, ssim_lambda=ssim_lambda)
         return loss, torch.pow(10, -psnr / 10)
-    share, reach = (last - first) / height, len(WINDOW) // 2
-    begin, end = max(first - reach, 0), min(last + reach, height)
-    windows = (end - begin - 2 * reach) / (height - 2 * reach)
-    inside = slice(begin - top, end - top)
-    dissimilarity, _ = photometric_loss(predicted[:, inside], target[:, inside], ssim_lambda=1.0, l2_lambda=0.0)
+    # SSIM of the windows that are centred in these rows, and their share of all windows.
+    reach = len(WINDOW) // 2
+    begin = max(first - reach, 0)
+    end = min(last + reach, height)
+    share_of_windows = (end - begin - 2 * reach) / (height - 2 * reach)
+    reached = slice(begin - top, end - top)
+    dissimilarity, _ = photometric_loss(predicted[:, reached], target[:, reached], ssim_lambda=1.0, l2_lambda=0.0)
+    # The other two terms of these rows, and their share of all rows.
+    share = (last - first) / height
     counted = slice(first - top, last - top)
-    values = target[:, counted]
-    difference = predicted[:, counted] - (values / 255.0 if values.dtype == torch.uint8 else values)
-    l1, l2 = difference.abs().mean(), difference.square().mean()
-    loss = share * ((1 - ssim_lambda) * l1 + L2_LAMBDA * l2) + windows * ssim_lambda * dissimilarity
+    difference = predicted[:, counted] - _as_floats(target[:, counted])
+    l1 = difference.abs().mean()
+    l2 = difference.square().mean()
+    of_pixels = (1 - ssim_lambda) * l1 + L2_LAMBDA * l2
+    loss = share * of_pixels + share_of_windows * ssim_lambda * dissimilarity
     return loss, share * l2.detach()

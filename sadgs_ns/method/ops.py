@@ -14,12 +14,14 @@ Params = MutableMapping[str, torch.nn.Parameter] | torch.nn.ParameterDict
 """gsplat's parameters by name, each with leading dimension N."""
 Optimizers = Mapping[str, torch.optim.Optimizer]
 """The optimizers of parameters by their names; a parameter that is not trained may have none."""
-State = MutableMapping[str, Any]  # The state of a strategy; its tensors have leading dimension N
+State = MutableMapping[str, Any]
+"""The state of a strategy; its tensors have leading dimension N."""
 
 
 def opacities(params: Params) -> Tensor:
-    """Return the opacities, without gradient. [N]"""
-    return torch.sigmoid(params["opacities"].detach().flatten())
+    """Return the opacities in [0, 1], without gradient. [N]"""
+    logits = params["opacities"].detach().flatten()
+    return torch.sigmoid(logits)
 
 
 @torch.no_grad()
@@ -37,24 +39,35 @@ def update_param_with_optimizer(
         optimizer_fn: Makes a new moment from its key and the old one; `step` stays.
         names: The parameters to change; None changes all.
     """
-    for name in list(params) if names is None else names:
-        old, optimizer = params[name], optimizers.get(name)
-        state = {} if optimizer is None else optimizer.state.pop(old, {})
+    if names is None:
+        names = list(params)
+    for name in names:
+        optimizer = optimizers.get(name)
+        old = params[name]
+        state = {}
+        if optimizer is not None:
+            state = optimizer.state.pop(old, {})
         for key, value in state.items():
             if key != "step":
                 state[key] = optimizer_fn(key, value)
-        params[name] = new = torch.nn.Parameter(param_fn(name, old), requires_grad=old.requires_grad)
+        new = torch.nn.Parameter(param_fn(name, old), requires_grad=old.requires_grad)
+        params[name] = new
         if optimizer is not None:
-            optimizer.param_groups[0]["params"], optimizer.state[new] = [new], state
+            optimizer.param_groups[0]["params"] = [new]
+            optimizer.state[new] = state
 
 
 def map_opacities(function: Callable[[Tensor], Tensor], params: Params, optimizers: Optimizers) -> None:
     """Change the opacities (not their logits) and forget their optimizer moments, as gsplat's reset does."""
 
-    def changed(name: str, p: Tensor) -> Tensor:
-        return torch.logit(function(torch.sigmoid(p)).clamp(1e-6, 1 - 1e-6))
+    def param_fn(name: str, p: Tensor) -> Tensor:
+        changed = function(torch.sigmoid(p))
+        return torch.logit(changed.clamp(1e-6, 1 - 1e-6))
 
-    update_param_with_optimizer(changed, lambda key, v: torch.zeros_like(v), params, optimizers, names=["opacities"])
+    def optimizer_fn(key: str, v: Tensor) -> Tensor:
+        return torch.zeros_like(v)
+
+    update_param_with_optimizer(param_fn, optimizer_fn, params, optimizers, names=["opacities"])
 
 
 def rebalance(world: World, params: Params, optimizers: Optimizers, state: State) -> None:
@@ -62,9 +75,14 @@ def rebalance(world: World, params: Params, optimizers: Optimizers, state: State
     world.count(len(params["means"]))
     if not world.is_uneven():
         return
-    update_param_with_optimizer(
-        lambda name, p: world.rebalance(p.detach()), lambda key, v: world.rebalance(v), params, optimizers
-    )
+
+    def param_fn(name: str, p: Tensor) -> Tensor:
+        return world.rebalance(p.detach())
+
+    def optimizer_fn(key: str, v: Tensor) -> Tensor:
+        return world.rebalance(v)
+
+    update_param_with_optimizer(param_fn, optimizer_fn, params, optimizers)
     for key, value in state.items():
         if isinstance(value, Tensor):
             state[key] = world.rebalance(value)

@@ -28,7 +28,10 @@ DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
 """Shortest run that resets opacities, in iterations: a reset cost shorter ones 2.7 to 11 dB (docs/results.md)."""
-_PARTS = 30  # A run is divided into this many parts of equal length, in whole iterations
+LATEST_STOP = (19, 30)
+"""Largest share of a run in which Gaussians may be added and removed, as a fraction (released code)."""
+_PARTS = 30
+"""A run is divided into this many parts of equal length, in whole iterations."""
 _WINDOWS = {
     "structure_every": 5,
     "absgs_every": 1,
@@ -70,15 +73,24 @@ def schedule(
     With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
     multiplies it if views are many (`MORE_VISITS_FROM`). A step takes one more view for every 2,000 visits, up to four.
     """
-    few, many = MORE_VISITS_FROM
-    power = 1.0 if effort <= 1 else min(max((num_views - few) / (many - few), 0.0), 1.0)
-    visits = effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+    visits = _view_visits(num_views, effort)
     if views_per_iteration is None:
-        views_per_iteration = min(max(int(visits) // STEPS_BEFORE_VIEWS, 1), MOST_VIEWS)
+        affordable = int(visits) // STEPS_BEFORE_VIEWS
+        views_per_iteration = min(max(affordable, 1), MOST_VIEWS)
     views_per_iteration = min(views_per_iteration, num_views)
     if iterations is None:
         iterations = math.ceil(visits / views_per_iteration)
     return Schedule(iterations, views_per_iteration)
+
+
+def _view_visits(num_views: int, effort: float) -> float:
+    """Derive how many view visits a run should have."""
+    power = 1.0
+    if effort > 1:
+        few, many = MORE_VISITS_FROM
+        power = (num_views - few) / (many - few)
+        power = min(max(power, 0.0), 1.0)
+    return effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
 
 
 @lru_cache(maxsize=64)
@@ -94,9 +106,13 @@ def windows(iterations: int, **given: int | None) -> Windows:
     derived = {name: max(round(parts * part), 1) for name, parts in _WINDOWS.items()}
     if iterations < RESETS_FROM:
         derived["reset_every"] = 0
-    chosen = Windows(**derived | {name: value for name, value in given.items() if value is not None})
-    stop = min(chosen.refine_stop_iter, iterations * 19 // 30)
-    return replace(chosen, refine_stop_iter=stop if stop >= chosen.refine_start_iter else 0)
+    chosen = {name: value for name, value in given.items() if value is not None}
+    result = Windows(**(derived | chosen))
+    numerator, denominator = LATEST_STOP
+    stop = min(result.refine_stop_iter, iterations * numerator // denominator)
+    if stop < result.refine_start_iter:
+        stop = 0
+    return replace(result, refine_stop_iter=stop)
 
 
 def due(iteration: int, every: int) -> bool:
@@ -106,13 +122,17 @@ def due(iteration: int, every: int) -> bool:
 
 def next_due(iteration: int, every: int) -> float:
     """Return the first iteration, from this one on, at which it is `due`; infinity if never."""
-    return -(-iteration // every) * every if every > 0 else math.inf
+    if every <= 0:
+        return math.inf
+    return math.ceil(iteration / every) * every
 
 
 def growth_threshold(effort: float) -> float:
     """Factor on the gradients at which AbsGS adds Gaussians: effort above 1 adds more of them."""
+    if effort <= 1:
+        return 1.0
     power, least = GROWTH_WITH_EFFORT
-    return max(effort**power, least) if effort > 1 else 1.0
+    return max(effort**power, least)
 
 
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
@@ -120,4 +140,5 @@ def between_one_and_four(views_per_iteration: int, at_four: float) -> float:
 
     From four views on it is `at_four`, > 0; below, it is the power of the number of views that is `at_four` at four.
     """
-    return float(at_four ** min(math.log(views_per_iteration, MOST_VIEWS), 1.0))
+    power = min(math.log(views_per_iteration, MOST_VIEWS), 1.0)
+    return float(at_four**power)

@@ -13,7 +13,7 @@ from sadgs_ns.render.rasterization import visible
 
 
 def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
-    """Sums `grad2d`, `absgrad2d` and the number of views `grad_count` that they run over, each float32 [N]."""
+    """Return sums `grad2d` and `absgrad2d`, and the number of views `grad_count`, all 0. float32 [N] each"""
     zeros = torch.zeros(num_gaussians, device=device)
     return {"grad2d": zeros, "absgrad2d": zeros.clone(), "grad_count": zeros.clone()}
 
@@ -42,15 +42,27 @@ def accumulate_gradients(gradients: MutableMapping[str, Tensor], info: Mapping[s
     if gradient is None:
         gradient = means2d.grad
     # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
-    scale_x, scale_y = info["width"] / 2.0 * num_views, info["height"] / 2.0 * num_views
+    scale_x = info["width"] / 2.0 * num_views
+    scale_y = info["height"] / 2.0 * num_views
+    scales = (scale_x, scale_y)
     if use_triton(means2d):
         from sadgs_ns.kernels import screen_gradients as kernel
 
-        sums = gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"]
-        kernel.accumulate_gradients(sums, info["radii"], gradient, means2d.absgrad, (scale_x, scale_y))
+        sums = (gradients["grad2d"], gradients["absgrad2d"], gradients["grad_count"])
+        kernel.accumulate_gradients(sums, info["radii"], gradient, means2d.absgrad, scales)
         return
     seen = visible(info)  # [C, N]
-    for key, value in (("grad2d", gradient), ("absgrad2d", means2d.absgrad)):
-        norm = torch.hypot(value[..., 0] * scale_x, value[..., 1] * scale_y)  # [C, N]
-        gradients[key] += torch.where(seen, norm, 0.0).nansum(0)
+    gradients["grad2d"] += _sum_of_lengths(gradient, scales, seen)
+    gradients["absgrad2d"] += _sum_of_lengths(means2d.absgrad, scales, seen)
     gradients["grad_count"] += seen.sum(0)
+
+
+def _sum_of_lengths(
+    gradient: Tensor,  # [C, N, 2]
+    scales: tuple[float, float],  # factors on its x and y
+    seen: Tensor,  # bool [C, N]
+) -> Tensor:
+    """Sum the lengths of scaled gradients over the views that see a Gaussian; NaN counts as 0. [N]"""
+    scale_x, scale_y = scales
+    lengths = torch.hypot(gradient[..., 0] * scale_x, gradient[..., 1] * scale_y)  # [C, N]
+    return torch.where(seen, lengths, 0.0).nansum(0)

@@ -21,6 +21,8 @@ HIGH_ETA = 1.0
 """η above this is a violation: the axis is longer than the local wavelength (paper, section 3.4)."""
 LOW_ETA = 0.1
 """η below this is a low response: the axis covers a smooth region (paper, section 3.4)."""
+_INPUTS = ("radii", "means2d", "conics", "structure_tensors", "viewmats", "Ks")
+"""What the Triton kernel reads of gsplat's info."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,23 @@ class Statistic:
 
 
 def _count(values: Tensor, happened: Tensor) -> None:
+    """Add the number of views in which something happened, bool [C, N, ...], to values [N, ...]."""
     values.add_(happened.sum(0, dtype=values.dtype))
+
+
+# Below, a comparison with NaN is false, so that what was not observed is not counted.
+
+
+def _count_high(values: Tensor, eta: Tensor) -> None:
+    _count(values, eta > HIGH_ETA)
+
+
+def _count_low(values: Tensor, eta: Tensor) -> None:
+    _count(values, eta < LOW_ETA)
+
+
+def _count_observations(values: Tensor, eta: Tensor) -> None:
+    _count(values, eta[..., 0] >= 0)
 
 
 def _keep_largest(values: Tensor, eta: Tensor) -> None:
@@ -43,12 +61,11 @@ def _keep_largest(values: Tensor, eta: Tensor) -> None:
         torch.fmax(values, of_view, out=values)
 
 
-# A comparison with NaN is false.
 STATISTICS: dict[str, Statistic] = {
-    "n_high": Statistic((3,), lambda values, eta: _count(values, eta > HIGH_ETA)),
-    "n_low": Statistic((3,), lambda values, eta: _count(values, eta < LOW_ETA)),
+    "n_high": Statistic((3,), _count_high),
+    "n_low": Statistic((3,), _count_low),
     "eta_max": Statistic((3,), _keep_largest),
-    "n_total": Statistic((), lambda values, eta: _count(values, eta[..., 0] >= 0)),
+    "n_total": Statistic((), _count_observations),
 }
 """The statistics by their names in the strategy's state: numbers of violations, of low responses, the largest η of each
 axis, and the number of observations. One that is added here is kept, emptied, saved and planned for like these."""
@@ -56,7 +73,10 @@ axis, and the number of observations. One that is added here is kept, emptied, s
 
 def empty_statistics(num_gaussians: int, device: torch.device) -> dict[str, Tensor]:
     """Return the `STATISTICS` of Gaussians that no view has observed yet."""
-    return {name: torch.zeros((num_gaussians, *s.shape), device=device) for name, s in STATISTICS.items()}
+    empty = {}
+    for name, statistic in STATISTICS.items():
+        empty[name] = torch.zeros((num_gaussians, *statistic.shape), device=device)
+    return empty
 
 
 @torch.no_grad()
@@ -87,37 +107,55 @@ def observed_eta(
     pixel, and its η is finite on all axes. The arguments are those of `observe`.
     """
     if use_triton(params["means"]):
-        from sadgs_ns.kernels import statistics as kernel
-
-        return kernel.observed_eta(
-            (params["means"], params["quats"], params["scales"]),
-            **{name: info[name] for name in ("radii", "means2d", "conics", "structure_tensors", "viewmats", "Ks")},
-            jitter=jitter,
-            constants=(SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON),
-            quantization=(HIGHEST_FREQUENCY, OCTAVES, INVALID),
-        )
+        return _observed_eta_by_kernel(params, info, jitter)
     seen = visible(info)  # [C, N]
-    num_cameras, num_gaussians = seen.shape
-    scales, views = torch.exp(params["scales"]), []
-    # Every Gaussian is measured, and unseen ones are masked out: selecting first would make the host wait.
-    for camera in range(num_cameras):
-        camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
-        viewmats = info["viewmats"][camera].expand(num_gaussians, 4, 4)
-        Ks = info["Ks"][camera].expand(num_gaussians, 3, 3)
-        shapes = params["means"], params["quats"], scales
-        axes = projected_axes(*shapes, viewmats, Ks, info["width"], info["height"])  # [N, 3, 2]
-        # An unseen Gaussian's projection is garbage, so its sample is moved to a place where nothing can overflow.
-        means2d = torch.where(seen[camera, :, None], info["means2d"][camera], -1.0)
-        a, b, c = info["conics"][camera].unbind(-1)
-        # Python numbers: a tensor made of them here would make the host wait for its copy to the device.
-        a, b, c = (torch.where(seen[camera], *pair) for pair in ((a, 1.0), (b, 0.0), (c, 1.0)))
-        conics = torch.stack([a, b, c], -1)
-        points = sample_footprint(means2d, conics, jitter[camera])
-        sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
-        violation = eta(axes, sampled)  # [N, 3]
-        observed = (seen[camera] & inside & violation.isfinite().all(dim=1))[:, None]  # [N, 1]
-        views.append(torch.where(observed, violation, torch.nan))
+    scales = torch.exp(params["scales"])
+    shapes = (params["means"], params["quats"], scales)
+    views = []
+    for camera in range(len(seen)):
+        views.append(_eta_in_view(shapes, info, camera, seen[camera], jitter[camera]))
     return torch.stack(views)
+
+
+def _observed_eta_by_kernel(params: Params, info: Mapping[str, Any], jitter: Tensor) -> Tensor:
+    from sadgs_ns.kernels import statistics as kernel
+
+    shapes = (params["means"], params["quats"], params["scales"])
+    inputs = {name: info[name] for name in _INPUTS}
+    constants = (SCREEN_BLUR, FRUSTUM_MARGIN, WAVELENGTH_EPSILON)
+    quantization = (HIGHEST_FREQUENCY, OCTAVES, INVALID)
+    return kernel.observed_eta(shapes, **inputs, jitter=jitter, constants=constants, quantization=quantization)
+
+
+def _eta_in_view(
+    shapes: tuple[Tensor, Tensor, Tensor],  # means [N, 3], quats [N, 4] and standard deviations [N, 3]
+    info: Mapping[str, Any],
+    camera: int,  # index of the view in `info`
+    seen: Tensor,  # bool [N]
+    jitter: Tensor,  # [N, 2] in [0, 1)
+) -> Tensor:
+    """Return η of the axes in one view, NaN where there is no observation. [N, 3]
+
+    Every Gaussian is measured, and unseen ones are masked out: selecting first would make the host wait.
+    """
+    num_gaussians = len(seen)
+    viewmats = info["viewmats"][camera].expand(num_gaussians, 4, 4)
+    Ks = info["Ks"][camera].expand(num_gaussians, 3, 3)
+    axes = projected_axes(*shapes, viewmats, Ks, info["width"], info["height"])  # [N, 3, 2]
+    # An unseen Gaussian's projection is garbage, so its sample is moved to a place where nothing can overflow. The
+    # values are Python numbers: a tensor made of them here would make the host wait for its copy to the device.
+    means2d = torch.where(seen[:, None], info["means2d"][camera], -1.0)
+    a, b, c = info["conics"][camera].unbind(-1)
+    a = torch.where(seen, a, 1.0)
+    b = torch.where(seen, b, 0.0)
+    c = torch.where(seen, c, 1.0)
+    conics = torch.stack([a, b, c], -1)
+    points = sample_footprint(means2d, conics, jitter)
+    camera_ids = torch.full((num_gaussians,), camera, device=seen.device)  # [N]
+    sampled, inside = sample_map(info["structure_tensors"], camera_ids, points)
+    found = eta(axes, sampled)  # [N, 3]
+    observed = seen & inside & found.isfinite().all(dim=1)
+    return torch.where(observed[:, None], found, torch.nan)
 
 
 def consistent(
@@ -126,8 +164,10 @@ def consistent(
     threshold: float,
     min_observations: int = 1,
 ) -> Tensor:
-    """Whether a response was seen in more than a fraction of the observations: N / N_total > τ (paper, section 3.4).
+    """Tell where a response was seen in more than a share of the observations: N / N_total > τ (paper, section 3.4).
 
     `counts` are `n_high` or `n_low`, with τ_split or τ_prune. Fewer than `min_observations` say nothing. bool [N, 3]
     """
-    return (counts > threshold * n_total[:, None]) & (n_total >= min_observations)[:, None]
+    is_frequent = counts > threshold * n_total[:, None]
+    is_known = n_total >= min_observations
+    return is_frequent & is_known[:, None]

@@ -94,40 +94,42 @@ def multiscale_structure_tensor(
     """
     if epsilon is not None and not epsilon > 0:
         raise ValueError(f"epsilon must be positive, or None for one relative to the contrast, got {epsilon:g}")
-    image, valid, brightest, contrast = _normalised(images, masks, known_finite)
+    _check_shapes(images, masks)
+    image, valid = _valid_pixels(images, masks, known_finite)
+    image, brightest, contrast = _normalise(image, valid)
     levels = [SCALE_STEP**level for level in range(NUM_LEVELS)]  # σ_l in px
     if epsilon is None:
-        noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)  # [B, 1, 1, 1]
-        trace_floors, weight_floor = [(noise / sigma) ** 2 for sigma in levels], noise**GAMMA
-    else:  # the image was divided by its brightest value, and so S_l by its square and E_l^γ by its power
-        smallest = torch.finfo(image.dtype).tiny
-        trace_floors = [(epsilon / brightest.square()).clamp_min(smallest)] * NUM_LEVELS
-        weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
-    correlate, differentiate, aggregate = _correlate, _differentiate, _aggregate
-    if use_triton(image):
-        from sadgs_ns.kernels import limits
-        from sadgs_ns.kernels.structure_tensor import aggregate, correlate, differentiate
-
-        limits.check_batch(*image.shape)
-    # Without masks all images have the same weights.
-    sums = _WeightedSums(valid[:1] if masks is None else valid, masks is not None, correlate)
+        trace_floors, weight_floor = _floors_of_contrast(contrast, noise_floor, levels)
+    else:
+        trace_floors, weight_floor = _floors_of_epsilon(brightest, epsilon)
+    operators = _choose_operators(image)
+    if masks is None:
+        # All images have the same weights.
+        sums = _WeightedSums(valid[:1], False, operators.correlate)
+    else:
+        sums = _WeightedSums(valid, True, operators.correlate)
     numerator = torch.zeros_like(image[:, :1]).repeat(1, 3, 1, 1)  # [B, 3, H, W]
     denominator = weight_floor.expand_as(valid).contiguous()  # [B, 1, H, W]
     previous = image  # I_{l−1}
-    for level, sigma in enumerate(levels):
+    for sigma, trace_floor in zip(levels, trace_floors, strict=True):
         # The scale space: I_l and its gradient.
-        blurs, totals = sums.blur_and_gradient(image, sigma), sums.total_and_gradient(sigma)
-        smoothed, products, energy = differentiate(blurs, totals, sums.weight, previous)
+        blurs = sums.blur_and_gradient(image, sigma)
+        totals = sums.total_and_gradient(sigma)
+        smoothed, products, energy = operators.differentiate(blurs, totals, sums.weight, previous)
         # Eq. 2, the structure tensor: S_l is the mean of the gradient's products over a window of ρ_l.
         rho = INTEGRATION_FACTOR * sigma
-        tensor = sums.blur(products, rho), sums.total(rho)
+        tensor = (sums.blur(products, rho), sums.total(rho))
         # Eq. 4, the band energy: E_l² is (I_{l−1} − I_l)², or its mean over a window.
-        total = torch.ones_like(sums.weight)
-        if (window := energy_blur * sigma) > 0:
-            energy, total = sums.blur(energy, window), sums.total(window)
+        window = energy_blur * sigma
+        if window > 0:
+            energy = sums.blur(energy, window)
+            energy_weight = sums.total(window)
+        else:
+            energy_weight = torch.ones_like(sums.weight)
         # Eq. 3 and 5: normalise S_l, and add it with its weight E_l^γ ω_l².
         frequency = frequency_constant / sigma
-        aggregate(tensor, (energy, total), trace_floors[level], numerator, denominator, 0.5 * GAMMA, frequency)
+        band = (energy, energy_weight)
+        operators.aggregate(tensor, band, trace_floor, numerator, denominator, 0.5 * GAMMA, frequency)
         previous = smoothed
     result = numerator / denominator
     if masks is not None:
@@ -135,37 +137,103 @@ def multiscale_structure_tensor(
     return result.permute(0, 2, 3, 1).contiguous()
 
 
-def _normalised(images: Tensor, masks: Tensor | None, known_finite: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Check the images, and scale and centre their valid pixels; raises ValueError as `multiscale_structure_tensor`.
+@dataclass(frozen=True)
+class _Operators:
+    """The three operators of a level, in torch or as Triton kernels."""
 
-    Returns:
-        The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; 1 at valid pixels and 0 at masked ones
-        [B, 1, H, W]; the largest absolute value, by which they were divided [B, 1, 1, 1]; and their contrast after
-        that, the root of the mean squared distance from the mean colour [B, 1, 1, 1].
+    correlate: Callable[[Tensor, Tensor, int], Tensor]  # Arguments as `_correlate`
+    differentiate: Callable[..., tuple[Tensor, Tensor, Tensor]]  # Arguments as `_differentiate`
+    aggregate: Callable[..., None]  # Arguments as `_aggregate`
+
+
+def _choose_operators(
+    image: Tensor,  # [B, C, H, W]
+) -> _Operators:
+    """Choose Triton kernels where they work; raises InputError if they cannot address the images."""
+    if not use_triton(image):
+        return _Operators(_correlate, _differentiate, _aggregate)
+    from sadgs_ns.kernels import limits, structure_tensor
+
+    limits.check_batch(*image.shape)
+    return _Operators(structure_tensor.correlate, structure_tensor.differentiate, structure_tensor.aggregate)
+
+
+def _floors_of_contrast(
+    contrast: Tensor,  # [B, 1, 1, 1]
+    noise_floor: float,
+    levels: list[float],  # σ_l in px
+) -> tuple[list[Tensor], Tensor]:
+    """ε of eq. 3 for each level, and ε of eq. 5, relative to the contrast of each image. [B, 1, 1, 1] each"""
+    noise = (noise_floor * contrast).clamp_min(_ROUNDING_FLOOR)
+    trace_floors = [(noise / sigma) ** 2 for sigma in levels]
+    return trace_floors, noise**GAMMA
+
+
+def _floors_of_epsilon(
+    brightest: Tensor,  # [B, 1, 1, 1]
+    epsilon: float,
+) -> tuple[list[Tensor], Tensor]:
+    """ε of eq. 3 for each level, and ε of eq. 5, as the paper prints them, one number for all. [B, 1, 1, 1] each
+
+    The image was divided by its brightest value, so S_l was by its square, and E_l^γ by its power.
     """
+    smallest = torch.finfo(brightest.dtype).tiny
+    trace_floor = (epsilon / brightest.square()).clamp_min(smallest)
+    weight_floor = (epsilon / brightest**GAMMA).clamp_min(smallest)
+    return [trace_floor] * NUM_LEVELS, weight_floor
+
+
+def _check_shapes(images: Tensor, masks: Tensor | None) -> None:
+    """Raise ValueError if images or masks have another type or shape than `multiscale_structure_tensor` takes."""
     if images.dim() != 4 or not images.is_floating_point():
         raise ValueError(f"images must be floating point [B, H, W, C], got {images.dtype} {tuple(images.shape)}")
     if 0 in images.shape:
         raise ValueError(f"images must have pixels and channels, got [B, H, W, C] = {tuple(images.shape)}")
     if masks is not None and masks.shape != images.shape[:3]:
         raise ValueError(f"masks must be [B, H, W] = {tuple(images.shape[:3])}, got {tuple(masks.shape)}")
+
+
+def _valid_pixels(images: Tensor, masks: Tensor | None, known_finite: bool) -> tuple[Tensor, Tensor]:
+    """Return the images with 0 at masked pixels [B, C, H, W], and 1 at valid pixels and 0 at masked ones [B, 1, H, W].
+
+    Raises:
+        ValueError: If a valid pixel is NaN or infinite.
+    """
     image = images.permute(0, 3, 1, 2).contiguous()  # [B, C, H, W]; with channels-last strides cuDNN is slower
     image = image.to(torch.promote_types(image.dtype, torch.float32))
-    # A transposed mask would stay so, and hand its strides on to whatever it is combined with.
-    valid = torch.ones_like(image[:, :1]) if masks is None else masks[:, None].to(image).contiguous()
-    image = torch.where(valid > 0, image, 0.0)  # a product would let NaN through
+    valid = torch.ones_like(image[:, :1])
+    if masks is not None:
+        # A transposed mask would stay so, and hand its strides on to whatever it is combined with.
+        valid = masks[:, None].to(image).contiguous()
+    image = torch.where(valid > 0, image, 0.0)  # A product would let NaN through.
     # One such pixel would spread over the whole image, since its contrast scales everything.
     if not known_finite and not image.isfinite().all():
-        broken = (~image.isfinite()).flatten(1).any(dim=1).nonzero().flatten().tolist()
+        is_broken = ~image.isfinite()
+        broken = is_broken.flatten(1).any(dim=1).nonzero().flatten().tolist()
         raise ValueError(f"images {broken} of the batch hold NaN or infinite pixels; mask or replace those")
+    return image, valid
+
+
+def _normalise(
+    image: Tensor,  # [B, C, H, W], 0 at masked pixels
+    valid: Tensor,  # 1 at valid pixels and 0 at masked ones [B, 1, H, W]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Scale and centre the valid pixels of each image.
+
+    Returns:
+        The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; the largest absolute value, by which they
+        were divided [B, 1, 1, 1]; and their contrast after that, the root of the mean squared distance from the mean
+        colour [B, 1, 1, 1].
+    """
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
-    image = image / brightest  # HDR and tiny exposures then behave alike
+    image = image / brightest  # HDR and tiny exposures then behave alike.
     count = valid.sum(dim=(2, 3), keepdim=True).clamp_min(1)
     mean = image.sum(dim=(2, 3), keepdim=True) / count
     # Every operator is blind to a constant, and without it float32 rounds relative to the contrast, not the brightness.
     image = (image - mean) * valid
-    contrast = (image.square().sum(dim=1, keepdim=True).sum(dim=(2, 3), keepdim=True) / count).sqrt()
-    return image, valid, brightest, contrast
+    squares = image.square().sum(dim=1, keepdim=True)  # [B, 1, H, W]
+    contrast = (squares.sum(dim=(2, 3), keepdim=True) / count).sqrt()
+    return image, brightest, contrast
 
 
 @dataclass(frozen=True)
@@ -182,12 +250,16 @@ class _WeightedSums:
 
     def blur_and_gradient(self, image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
         """Gaussian blur, and its exact x and y derivatives per px. [B, C, H, W] → each [B, C, H, W]"""
-        rows, derived_rows = self._along(image, sigma, 0, 2), self._along(image, sigma, 1, 2)
-        return self._along(rows, sigma, 0, 3), self._along(rows, sigma, 1, 3), self._along(derived_rows, sigma, 0, 3)
+        down = self._along(image, sigma, 0, 2)
+        derived_down = self._along(image, sigma, 1, 2)
+        blurred = self._along(down, sigma, 0, 3)
+        along_x = self._along(down, sigma, 1, 3)
+        along_y = self._along(derived_down, sigma, 0, 3)
+        return blurred, along_x, along_y
 
     def total(self, sigma: float) -> Tensor:
         """`blur` of the weights, positive. [1 or B, 1, H, W]"""
-        total = self.blur(self.weight, sigma) if self.masked else self._unmasked(sigma, 0, 0)
+        total = self._blurred_weight(sigma)
         return total.clamp_min(torch.finfo(total.dtype).tiny)
 
     def total_and_gradient(self, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -195,26 +267,43 @@ class _WeightedSums:
         if self.masked:
             total, total_x, total_y = self.blur_and_gradient(self.weight, sigma)
         else:
-            total, total_x, total_y = (self._unmasked(sigma, *orders) for orders in ((0, 0), (1, 0), (0, 1)))
+            total = self._unmasked(sigma, 0, 0)
+            total_x = self._unmasked(sigma, 1, 0)
+            total_y = self._unmasked(sigma, 0, 1)
         return total.clamp_min(torch.finfo(total.dtype).tiny), total_x, total_y
 
+    def _blurred_weight(self, sigma: float) -> Tensor:
+        if self.masked:
+            return self.blur(self.weight, sigma)
+        return self._unmasked(sigma, 0, 0)
+
     def _unmasked(self, sigma: float, order_x: int, order_y: int) -> Tensor:
-        """Blur of ones, which a row and a column of them tell. [1, 1, H, W]"""
-        down, across = self.weight[..., :1], self.weight[..., :1, :]
-        return self._along(down, sigma, order_y, 2) * self._along(across, sigma, order_x, 3)
+        """Blur of ones or its derivative, as the product of those of a column and of a row of ones. [1, 1, H, W]"""
+        column = self._along(self.weight[..., :1], sigma, order_y, 2)
+        row = self._along(self.weight[..., :1, :], sigma, order_x, 3)
+        return column * row
 
     def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:
-        return self.correlate(image, gaussian_kernel(sigma, order, image.dtype, image.device), axis)
+        """Blur, or its derivative for order 1, along axis 2 (y) or 3 (x)."""
+        kernel = gaussian_kernel(sigma, order, image.dtype, image.device)
+        return self.correlate(image, kernel, axis)
 
 
 def _correlate(image: Tensor, kernel: Tensor, axis: int) -> Tensor:
     """Correlate images [B, C, H, W] along axis 2 (y) or 3 (x) with a kernel of odd length; outside there are zeros."""
-    channels, size, radius = image.shape[1], image.shape[axis], kernel.numel() // 2
-    if radius >= size:  # taps that can only ever meet zeros
+    channels = image.shape[1]
+    size = image.shape[axis]
+    radius = kernel.numel() // 2
+    if radius >= size:
+        # The other taps can only meet zeros.
         kernel = kernel[radius - size + 1 : radius + size]
         radius = size - 1
-    shape = (1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)
-    padding = (radius, 0) if axis == 2 else (0, radius)
+    if axis == 2:
+        shape = (1, 1, -1, 1)
+        padding = (radius, 0)
+    else:
+        shape = (1, 1, 1, -1)
+        padding = (0, radius)
     weight = kernel.view(shape).expand(channels, -1, -1, -1)
     # Full float32, and no search for the fastest algorithm.
     with torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=False):
@@ -233,14 +322,23 @@ def _differentiate(
         I_l [B, C, H, W]; and, times the weights, the products xx, xy, yy of its gradient, summed over the channels
         [B, 3, H, W], and the squared difference from I_{l−1}, summed likewise [B, 1, H, W].
     """
-    smoothed = blurs[0] / totals[0]
+    blurred, blurred_x, blurred_y = blurs
+    total, total_x, total_y = totals
+    smoothed = blurred / total
     # The derivative of the quotient.
-    gradient_x = (blurs[1] - smoothed * totals[1]) / totals[0]
-    gradient_y = (blurs[2] - smoothed * totals[2]) / totals[0]
-    products = torch.stack(
-        [gradient_x.square().sum(1), (gradient_x * gradient_y).sum(1), gradient_y.square().sum(1)], dim=1
-    )
-    return smoothed, products * weight, (previous - smoothed).square().sum(1, keepdim=True) * weight
+    gradient_x = (blurred_x - smoothed * total_x) / total
+    gradient_y = (blurred_y - smoothed * total_y) / total
+    products = _summed_products(gradient_x, gradient_y)
+    energy = (previous - smoothed).square().sum(1, keepdim=True)
+    return smoothed, products * weight, energy * weight
+
+
+def _summed_products(gradient_x: Tensor, gradient_y: Tensor) -> Tensor:
+    """Products xx, xy, yy of gradients [B, C, H, W], summed over the channels. [B, 3, H, W]"""
+    xx = gradient_x.square().sum(1)
+    xy = (gradient_x * gradient_y).sum(1)
+    yy = gradient_y.square().sum(1)
+    return torch.stack([xx, xy, yy], dim=1)
 
 
 def _aggregate(
@@ -254,7 +352,9 @@ def _aggregate(
 ) -> None:
     """Add a level to the sums of eq. 5, in place."""
     structure = tensor[0] / tensor[1]  # S_l, eq. 2
-    normalised = structure / (structure[:, :1] + structure[:, 2:] + trace_floor)  # Ŝ_l, eq. 3
-    weight = (energy[0] / energy[1]).clamp_min(0) ** exponent  # E_l^γ, eq. 4
+    trace = structure[:, :1] + structure[:, 2:]
+    normalised = structure / (trace + trace_floor)  # Ŝ_l, eq. 3
+    mean_energy = energy[0] / energy[1]  # E_l², eq. 4
+    weight = mean_energy.clamp_min(0) ** exponent  # E_l^γ
     numerator += weight * frequency**2 * normalised
     denominator += weight

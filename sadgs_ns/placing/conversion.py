@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
-from sadgs_ns.data.checks.images import color_profile
+from sadgs_ns.data.images import color_profile
 from sadgs_ns.errors import InputError
 from sadgs_ns.placing.panoramas import cut
 from sadgs_ns.placing.photos import Photo, empty_folder, threads

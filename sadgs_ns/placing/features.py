@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
-from sadgs_ns.data.checks.images import image_size
+from sadgs_ns.data.images import image_size
 from sadgs_ns.events import progress
 from sadgs_ns.host_memory import available_host_bytes
 from sadgs_ns.placing.panoramas import VIEWS, rotations
@@ -23,7 +23,9 @@ from sadgs_ns.placing.photos import threads
 MOST_FEATURES = 8192  # Most features of a photo, those with the most contrast; COLMAP's own limit
 MAX_SIDE = 3200  # Longest side in px to which photos are scaled down to find features, as COLMAP does
 _CONTRAST = 0.02  # COLMAP's least contrast of a feature; a photo in [0, 1] needs a third in a scale of three an octave.
-LISTED, UNLISTED = str.maketrans(" #", "\x1f\x1e"), str.maketrans("\x1f\x1e", " #")  # Stand-ins in names, and back
+# Stand-ins for characters in names, and the way back
+LISTED = str.maketrans(" #", "\x1f\x1e")
+UNLISTED = str.maketrans("\x1f\x1e", " #")
 _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles the photo's size first
 _AT_ONCE = 256  # Photos whose features are kept, at 1 MB each, until COLMAP has read the photos and they are saved
 
@@ -39,11 +41,13 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
     rename_images(database, UNLISTED)  # A run that was interrupted during matching left them.
     with pycolmap.Database.open(database) as opened:
         done_before = {image.name for image in opened.read_all_images() if opened.exists_descriptors(image.image_id)}
-    searched, done = [name for name in names if name not in done_before], len(done_before)
+    searched = [name for name in names if name not in done_before]
+    done = len(done_before)
     cv2.setNumThreads(1)  # Each thread of ours has a photo.
     with threads(_num_threads([image_size(photos / name) for name in searched])) as pool:
         for start in range(0, len(searched), _AT_ONCE):
-            lot, masks = searched[start : start + _AT_ONCE], database.with_name("masks")
+            lot = searched[start : start + _AT_ONCE]
+            masks = database.with_name("masks")
             found = {name: pool.submit(sift, photos / name, masks / f"{name}.png") for name in lot}
             _add_images(database, photos, groups, rigs, {*lot})  # This takes a while, because COLMAP reads each photo.
             with pycolmap.Database.open(database) as opened:
@@ -98,7 +102,9 @@ def _add_panorama(opened: pycolmap.Database, photos: Path, views: Sequence[str])
     rig = next((rig for rig in rigs if opened.read_camera(rig.ref_sensor_id.id).width == side), None)
     if rig is None:
         camera = pycolmap.Camera(model="PINHOLE", width=side, height=side, params=[side / 2] * 4)
-        ids, to_panorama, rig = [opened.write_camera(camera) for _ in views], rotations(), pycolmap.Rig()
+        ids = [opened.write_camera(camera) for _ in views]
+        to_panorama = rotations()
+        rig = pycolmap.Rig()
         sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id) for camera_id in ids]
         rig.add_ref_sensor(sensors[0])
         for sensor, rotation in zip(sensors[1:], to_panorama[1:], strict=True):
@@ -120,7 +126,8 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
         Their descriptors, as COLMAP compares them: 512 times the roots of SIFT's shares (RootSIFT). uint8 [N, 128]
     """
     image = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    points, values = (), None
+    points = ()
+    values = None
     if image is not None:
         height, width = image.shape
         if (shrink := min(1.0, MAX_SIDE / max(width, height))) < 1:

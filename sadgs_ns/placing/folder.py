@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.data import IMAGE_SUFFIXES
-from sadgs_ns.data.checks.colmap import automatic_options
-from sadgs_ns.data.checks.images import image_size
-from sadgs_ns.data.checks.transforms import frames_of, mended_name, read_json
+from sadgs_ns.data.images import IMAGE_SUFFIXES, image_size
+from sadgs_ns.data.layouts import automatic_options
+from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings
 
@@ -68,7 +67,8 @@ def _visible_files(folder: Path) -> list[str]:
 
     Folders that cannot be read are among them. Links to folders are followed, unless they lead to what is read anyway.
     """
-    paths, unread = list[Path](), list[OSError]()
+    paths = list[Path]()
+    unread = list[OSError]()
     seen = {top := Path(os.path.realpath(folder)), *top.parents}
     for parent, folders, files in os.walk(folder, onerror=unread.append, followlinks=True):
         paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
@@ -87,7 +87,8 @@ def images_of(cameras: Path, folder: Path) -> list[str]:
     They are those that its file of cameras names, or with a COLMAP model those in the capture's folder itself, in
     `masks` and where the model's images are: renderings of a run may lie in other folders.
     """
-    names, keys = list[str](), ("file_path", "mask_path")
+    names = list[str]()
+    keys = ("file_path", "mask_path")
     if cameras.suffix == ".json":
         with contextlib.suppress(InputError):  # Training tells what is wrong with the file, if it reads that one.
             frames = frames_of(read_json(cameras), cameras)
@@ -108,12 +109,15 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         import pi_heif
 
         pi_heif.register_heif_opener()  # Pillow then reads HEIC, but not where poses are given: training would not.
-    folder, scene = Path(os.path.realpath(source)), Path(os.path.realpath(out))
+    folder = Path(os.path.realpath(source))
+    scene = Path(os.path.realpath(out))
     files = _visible_files(folder)
     settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
     scenes = {scene, *(path.parents[1] for path in settings)}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
-    found, stems, masks = defaultdict(list), defaultdict(list), {}
+    found = defaultdict(list)
+    stems = defaultdict(list)
+    masks = {}
     for name in files:
         if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
             if kind == "photos" and name not in known:
@@ -139,7 +143,9 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
 
 def _kind(path: Path) -> str:
     """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
-    suffix, kind, start = path.suffix.lower(), "", b""
+    suffix = path.suffix.lower()
+    kind = ""
+    start = b""
     if path.is_dir():
         return "folders that cannot be read"
     with contextlib.suppress(OSError), path.open("rb") as file:  # What cannot be read is named later.
@@ -171,7 +177,8 @@ def _is_mask(path: Path) -> bool:
 def _is_swept(path: Path) -> bool:
     """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
     with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
-        is_whole, lens = image.width == 2 * image.height, Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
+        is_whole = image.width == 2 * image.height
+        lens = Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
         by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
         return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
     return False
@@ -179,7 +186,8 @@ def _is_swept(path: Path) -> bool:
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
     """Return the photos with the bytes of another, or with its name and about its content."""
-    groups, copies = defaultdict(list), []
+    groups = defaultdict(list)
+    copies = []
     for name in sorted(photos, key=len):
         if (folder / name).is_file() and (size := (folder / name).stat().st_size):
             groups[size].append(name)

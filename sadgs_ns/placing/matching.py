@@ -72,7 +72,8 @@ def _shared(descriptors: Tensor) -> Tensor:
 def _mutual(one: Tensor, other: Tensor) -> tuple[Tensor, ...]:
     """Return the indices of matches in both, after those in the batch. [..., N, 128], [..., M, 128]"""
     cosines = one @ other.mT  # The sums of products of bytes are exact. [..., N, M]
-    nearest, back = _nearest(cosines), _nearest(cosines.mT)
+    nearest = _nearest(cosines)
+    back = _nearest(cosines.mT)
     index = torch.arange(one.shape[-2], device=one.device)
     is_mutual = (nearest >= 0) & (back.gather(-1, nearest.clamp_min(0)) == index)
     return *is_mutual.nonzero(as_tuple=True), nearest[is_mutual]

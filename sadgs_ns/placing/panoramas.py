@@ -33,7 +33,8 @@ def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
     if size[0] != 2 * size[1] or b"equirectangular" in image.info.get("xmp", b""):
         return size[0] == 2 * size[1]  # Others are parts of a panorama.
     small = np.asarray(image.convert("L").resize((256, 128), Image.Resampling.BOX), float)
-    seam, steps = np.abs(small[:, 0] - small[:, -1]).mean(), np.abs(np.diff(small, axis=1))
+    seam = np.abs(small[:, 0] - small[:, -1]).mean()
+    steps = np.abs(np.diff(small, axis=1))
     poles = steps[[0, -1]].mean(1).max()  # Each is one point.
     return bool(max(seam / 3, 4 * poles) < steps.mean() and small[:, 0].std() > 0.1 * small.std())
 
@@ -42,7 +43,8 @@ def cut(panorama: Image.Image) -> list[Image.Image]:
     """Cut a panorama into its `VIEWS`, squares of half its height."""
     import cv2
 
-    pixels, border = np.asarray(panorama), cv2.BORDER_WRAP
+    pixels = np.asarray(panorama)
+    border = cv2.BORDER_WRAP
     maps = [map_of_view(i, panorama.height) for i in range(VIEWS)]
     return [Image.fromarray(cv2.remap(pixels, *places, cv2.INTER_CUBIC, borderMode=border)) for places in maps]
 
@@ -54,5 +56,6 @@ def map_of_view(view: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     across = (np.arange(side) + 0.5) / side * 2 - 1  # The tangents of angles up to 45° from the view's axis
     rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1) @ rotations()[view].T
     x, y, z = np.moveaxis(rays.astype(np.float32), -1, 0)
-    columns, rows = 1 + np.arctan2(x, z) / np.pi, 0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi
+    columns = 1 + np.arctan2(x, z) / np.pi
+    rows = 0.5 + np.arctan2(y, np.hypot(x, z)) / np.pi
     return columns * height - 0.5, rows * height - 0.5

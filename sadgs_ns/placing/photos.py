@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data.checks.images import NOT_UPRIGHT, SIDEWAYS, color_profile
+from sadgs_ns.data.images import NOT_UPRIGHT, SIDEWAYS, color_profile
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.placing.folder import COLMAP_FORMATS
 from sadgs_ns.placing.panoramas import VIEWS, is_panorama

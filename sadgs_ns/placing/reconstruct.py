@@ -9,9 +9,9 @@ import contextlib
 import io
 import itertools
 import json
-import shutil
-from collections.abc import Collection, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -23,10 +23,12 @@ import pycolmap
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
+from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
+from sadgs_ns.placing.undistortion import undistort
 
 if TYPE_CHECKING:
     import torch
@@ -72,15 +74,18 @@ def make_model(
         rigs: The names of the views of each panorama.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    names, database = sorted(itertools.chain(*groups, *rigs)), model.with_name("database.db")
+    names = sorted(itertools.chain(*groups, *rigs))
+    database = model.with_name("database.db")
     gpu, nerfstudio = begin_imports()
     if not model.exists():
         extract(photos, groups, database, rigs)
         match(names, database, matching, gpu.result(), rigs)
         place_cameras(photos, names, database, model, base)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
-    made, undistorted = pycolmap.Reconstruction(model), model.with_name("undistorted")
+    made = pycolmap.Reconstruction(model)
+    undistorted = model.with_name("undistorted")
     undistort(photos, model, made, max_size, known)
+    check_written(undistorted / "sparse" / "0", made)
     with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
         nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
@@ -109,7 +114,8 @@ def wake_gpu() -> torch.device | None:
 
 def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
     """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
-    described, first = json.loads(file.read_text()), {view: views[0] for views in rigs for view in views}
+    described = json.loads(file.read_text())
+    first = {view: views[0] for views in rigs for view in views}
     names = in_order([frame["file_path"] for frame in described["frames"]])
     whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
     chosen = list(dict.fromkeys(whole.values()))[4::10]
@@ -125,8 +131,10 @@ def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: 
     The views of a panorama, which have one centre, are not paired with each other. With "sequential" only those views
     of two panoramas are paired that look the same way, and fewer follow, because a panorama overlaps with many.
     """
-    in_turn, units = matching == "sequential", {views[0]: views for views in rigs}
-    first, axes = {view: views[0] for views in rigs for view in views}, rotations()[:, :, 2]
+    in_turn = matching == "sequential"
+    units = {views[0]: views for views in rigs}
+    first = {view: views[0] for views in rigs for view in views}
+    axes = rotations()[:, :, 2]
     order = list(dict.fromkeys(first.get(name, name) for name in (in_order(names) if in_turn else names)))
     pairs: list[tuple[str, str]] = []
     for a, b in sequential_pairs(order, 2 if rigs else 10) if in_turn else itertools.combinations(order, 2):
@@ -152,7 +160,8 @@ def match(
     """
     from sadgs_ns.placing.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
 
-    stage, pair_list = f"matches ({matching})", database.with_name("pairs.txt")
+    stage = f"matches ({matching})"
+    pair_list = database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
     verification.ransac.max_num_trials = _TRIALS
@@ -184,73 +193,125 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
     new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
     """
-    before = None if base is None else pycolmap.Reconstruction(base)
-    with pycolmap.Database.open(database) as opened:
-        total, rigs = opened.num_frames(), [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
-    fixed = {sensor.id for rig in rigs for sensor in rig.sensor_ids()}  # Panoramas are cut for these cameras.
-    others: dict[str, Any] = {"min_model_size": 3}
-    if before is not None:
-        others = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(names)}
-        fixed |= set(before.cameras)
-    others |= {"constant_cameras": fixed, "ba_refine_sensor_from_rig": False}
-    skips_points = not fixed  # Those that hold no photo wait for the last adjustment, which can hold nothing fixed.
-
-    def attempt(stage: str, limits: dict[str, float]) -> pycolmap.Reconstruction | None:
-        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **others)
-        options.mapper.mergedict({**_PLACING, "ba_global_ignore_redundant_points3D": skips_points, **limits})
-        registered = 0 if before is None else before.num_reg_frames()
-
-        def advance(more: int) -> None:
-            nonlocal registered
-            registered = min(registered + more, total)  # COLMAP goes on counting when it begins another model.
-            progress(stage, registered, total)
-
-        advance(0)
-        models = pycolmap.incremental_mapping(
-            database, photos, empty_folder(model.with_name("models")), options, input_path=base or "",
-            initial_image_pair_callback=lambda: advance(2), next_image_callback=lambda: advance(1),
-        )  # fmt: skip
-        largest = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
-        if skips_points and largest is not None:
-            pycolmap.bundle_adjustment(largest, options.get_global_bundle_adjustment())
-        return largest
-
-    def quality(candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
-        """Whether an attempt suffices, and how many photos it registered."""
-        if candidate is None:
-            return False, 0
-        cameras, count = [image.camera for image in candidate.images.values()], candidate.num_reg_images()
-        stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
-        return bool(count >= _ENOUGH * len(names) and abs(stretch) < _MOST_STRETCH), count
-
-    best, note = attempt("cameras", {}), ""
-    if not quality(best)[0]:
-        second = attempt("cameras (relaxed)", _RELAXED)
-        note = f"A first attempt registered {quality(best)[1]}, one with relaxed limits {quality(second)[1]}."
-        best = max(best, second, key=quality)
-    if before is None and best is None:
-        with pycolmap.Database.open(database) as opened:
-            images = opened.read_all_images()
-            poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
-        raise InputError(
-            f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
-            "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
+    search = _Search.of(photos, names, database, model, base)
+    best = search.attempt("cameras", {})
+    attempts = ""
+    if not search.quality(best)[0]:
+        second = search.attempt("cameras (relaxed)", _RELAXED)
+        attempts = (
+            f"A first attempt registered {search.quality(best)[1]}, one with relaxed limits "
+            f"{search.quality(second)[1]}."
         )
+        best = max(best, second, key=search.quality)
+    before = search.before
+    if before is None and best is None:
+        raise InputError(_unrelated(names, database))
     if best is None or (before is not None and best.num_reg_images() <= before.num_reg_images()):
         raise InputError(
             "none of the photos that were added could be related to the others: take some that share two thirds of "
             "what they show with each other and with those that are there, or take these out of the folder again."
         )
-    for frame_id, frame in before.frames.items() if before else ():  # COLMAP rounds poses that it holds fixed.
-        if frame.has_pose:
-            best.frames[frame_id].rig_from_world = frame.rig_from_world
+    for frame_id in search.held_frames:  # COLMAP rounds poses that it holds fixed.
+        assert before is not None
+        best.frames[frame_id].rig_from_world = before.frames[frame_id].rig_from_world
     best.extract_colors_for_all_images(photos)  # Otherwise a point has one photo's colour, or none.
     partial = empty_folder(model.with_name("model.partial"))
     best.write(partial)
     check_written(partial, best)
-    (partial / "attempts.txt").write_text(note)
+    (partial / "attempts.txt").write_text(attempts)
     partial.rename(model)
-    progress("cameras", total, total)
+    progress("cameras", search.total, search.total)
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What the attempts to place the cameras of some photos share."""
+
+    photos: Path  # The photos' folder
+    names: Sequence[str]
+    database: Path
+    models: Path  # Folder of COLMAP's models, which is made anew by each attempt
+    base: Path | None  # Folder of the model to which photos are added
+    before: pycolmap.Reconstruction | None  # That model
+    total: int  # Number of frames, each a photo or a panorama
+    fixed_cameras: set[int]  # Cameras whose intrinsics stay
+
+    @classmethod
+    def of(cls, photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> _Search:
+        with pycolmap.Database.open(database) as opened:
+            total = opened.num_frames()
+            rigs = [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
+        fixed = {sensor.id for rig in rigs for sensor in rig.sensor_ids()}  # Panoramas are cut for these cameras.
+        before = None
+        if base is not None:
+            before = pycolmap.Reconstruction(base)
+            fixed |= set(before.cameras)
+        return cls(photos, names, database, model.with_name("models"), base, before, total, fixed)
+
+    @property
+    def held_frames(self) -> list[int]:
+        """Frames of the earlier model, whose poses stay."""
+        if self.before is None:
+            return []
+        return [frame_id for frame_id, frame in self.before.frames.items() if frame.has_pose]
+
+    def options(self, limits: Mapping[str, float]) -> pycolmap.IncrementalPipelineOptions:
+        """Return COLMAP's options for an attempt with some limits of its mapper."""
+        chosen: dict[str, Any] = {"min_model_size": 3}
+        if self.before is not None:
+            chosen = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(self.names)}
+        chosen |= {"constant_cameras": self.fixed_cameras, "ba_refine_sensor_from_rig": False}
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **chosen)
+        # Points that hold no photo wait for the last adjustment.
+        skips_points = not self.fixed_cameras
+        options.mapper.mergedict({**_PLACING, "ba_global_ignore_redundant_points3D": skips_points, **limits})
+        return options
+
+    def attempt(self, stage: str, limits: Mapping[str, float]) -> pycolmap.Reconstruction | None:
+        """Place the cameras with some limits, and return the model with the most photos, or None without any."""
+        registered = 0
+        if self.before is not None:
+            registered = self.before.num_reg_frames()
+
+        def advance(more: int) -> None:
+            nonlocal registered
+            registered = min(registered + more, self.total)  # COLMAP goes on counting when it begins another model.
+            progress(stage, registered, self.total)
+
+        advance(0)
+        models = pycolmap.incremental_mapping(
+            self.database,
+            self.photos,
+            empty_folder(self.models),
+            self.options(limits),
+            input_path=self.base or "",
+            initial_image_pair_callback=lambda: advance(2),
+            next_image_callback=lambda: advance(1),
+        )
+        largest = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
+        if largest is not None:
+            adjust_robustly(largest, self.fixed_cameras, self.held_frames)
+        return largest
+
+    def quality(self, candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
+        """Tell whether an attempt suffices, and how many photos it registered."""
+        if candidate is None:
+            return False, 0
+        count = candidate.num_reg_images()
+        cameras = [image.camera for image in candidate.images.values()]
+        stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
+        return bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH), count
+
+
+def _unrelated(names: Sequence[str], database: Path) -> str:
+    """Return the sentence for photos of which no two could be related."""
+    with pycolmap.Database.open(database) as opened:
+        images = opened.read_all_images()
+        poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
+    return (
+        f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
+        "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
+    )
 
 
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
@@ -272,49 +333,12 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
         raise OSError(f"{folder} was not written completely: the disk is full")
 
 
-def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
-    """Write `images`, `alpha`, `masks` and their model, `sparse/0`, to the folder `undistorted`, which is made anew.
-
-    `made` is what `model` holds; `known` photos were undistorted before. Raise OSError if the model cannot be written.
-    """
-    folder = model.with_name("undistorted")
-    registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
-    progress("undistorted photos", 0, len(registered))
-    shutil.rmtree(folder, ignore_errors=True)
-    options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
-    with ThreadPoolExecutor(1) as pool:
-        undistortion = pool.submit(
-            pycolmap.undistort_images, folder, model, photos, image_names=[image.name for image in registered],
-            undistort_options=options, jpeg_quality=95,
-        )  # fmt: skip
-        while not undistortion.done():
-            wait([undistortion], timeout=0.5)
-            written = sum(path.is_file() for path in (folder / "images").rglob("*"))
-            progress("undistorted photos", written, len(registered))
-        undistortion.result()
-    for kind, image in itertools.product(("alpha", "masks"), registered):
-        if (stored := model.with_name(kind) / f"{image.name}.png").exists():
-            target = folder / kind / f"{image.name}.png"
-            target.parent.mkdir(parents=True, exist_ok=True)
-            grey = pycolmap.Bitmap.read(stored, as_rgb=False)
-            assert grey is not None  # `write_alpha` or `write_masks` wrote it
-            grey = pycolmap.undistort_image(options, grey, image.camera)[0]
-            if kind == "masks":
-                grey = pycolmap.Bitmap.from_array(np.uint8(255 * (grey.to_array() > 127)))
-            grey.write(target)
-    sparse = folder / "sparse"
-    (sparse / "0").mkdir()
-    for file in sparse.glob("*.bin"):
-        file.rename(sparse / "0" / file.name)
-    check_written(sparse / "0", made)
-    progress("undistorted photos", len(registered), len(registered))
-
-
 def summarize(
     names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
 ) -> Summary:
     """Count the registered photos, and find out why the others are none."""
-    registered, left_out = registered_photos(model), {}
+    registered = registered_photos(model)
+    left_out = {}
     with pycolmap.Database.open(database) as opened:
         identities = {image.name: image.image_id for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()

@@ -36,14 +36,16 @@ def colors_in_views(
     gaussians: Gaussians, viewmats: Tensor, radii: Tensor, means2d: Tensor, sh_degree: int | None
 ) -> Tensor:
     """Return colours as cameras see them [C, N, D], computed where Gaussians are drawn."""
-    num_views, colors = len(viewmats), gaussians.colors
+    num_views = len(viewmats)
+    colors = gaussians.colors
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     if sh_degree is None:
         return colors.expand(num_views, -1, -1)
     # gsplat inverts the matrices, which makes the host wait for the device.
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-    coefficients, drawn = colors.expand(num_views, -1, -1, -1), gsplat_compat.drawn(radii, means2d)
+    coefficients = colors.expand(num_views, -1, -1, -1)
+    drawn = gsplat_compat.drawn(radii, means2d)
     colors = gsplat.spherical_harmonics(sh_degree, gaussians.means - positions, coefficients, masks=drawn)
     return torch.clamp_min(colors + 0.5, 0.0)
 
@@ -51,7 +53,8 @@ def colors_in_views(
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
     radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
-    columns, rows = -(-width // TILE_SIZE), -(-height // TILE_SIZE)
+    columns = -(-width // TILE_SIZE)
+    rows = -(-height // TILE_SIZE)
     _, keys, flatten_ids = gsplat.isect_tiles(means2d, radii, depths, TILE_SIZE, columns, rows)
     starts = gsplat.isect_offset_encode(keys, len(means2d), columns, rows)
     renders, alphas = gsplat.rasterize_to_pixels(

@@ -17,7 +17,10 @@ from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
 TILE_SIZE = 16  # Size of tiles in px
 
-_MAX_ALPHA, _MIN_ALPHA, _MIN_TRANSMITTANCE = 0.999, 1.0 / 255.0, 1e-4  # The constants of gsplat's compositing
+# These three are the constants of gsplat's compositing.
+_MAX_ALPHA = 0.999
+_MIN_ALPHA = 1.0 / 255.0
+_MIN_TRANSMITTANCE = 1e-4
 _MAX_SIGMA = 60.0  # exp(-sigma) is invisible long before; beyond 87 it would be subnormal, many times slower to compute
 _CHUNK_PAIRS = 1 << 18  # Pairs of a pixel and a Gaussian held at a time in ten temporaries, unless a segment has more
 _SEGMENT = 128  # Most Gaussians of a tile's list that are composited at once, so that opaque tiles can stop early
@@ -52,7 +55,8 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     if isinstance(colors, tuple):
         colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
     viewmats, Ks, width, height = cameras
-    C, N = len(viewmats), len(means)
+    C = len(viewmats)
+    N = len(means)
     means2d, depths, conics, covars2d, valid = _project(
         means, quats, scales, viewmats, Ks, width, height, options.near_plane
     )
@@ -73,7 +77,8 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
     C = len(means2d)
     extents = (radii if radii.dim() == means2d.dim() else radii[..., None].expand_as(means2d)).to(means2d.dtype)
     tiles = _bin_into_tiles(means2d, depths, extents, width, height)
-    rows, columns = math.ceil(height / TILE_SIZE), math.ceil(width / TILE_SIZE)
+    rows = math.ceil(height / TILE_SIZE)
+    columns = math.ceil(width / TILE_SIZE)
     canvas: Tensor = _Composite.apply(means2d, conics, colors, opacities, tiles, options.absgrad)  # type: ignore[assignment]
     # [T, S * S, D + 1] -> [C, H, W, D + 1]: put the tiles' pixels in rows and crop what overhangs the image.
     canvas = canvas.reshape(C, rows, columns, TILE_SIZE, TILE_SIZE, -1).transpose(2, 3)
@@ -134,13 +139,16 @@ def _bin_into_tiles(
     height: int,
 ) -> _Tiles:
     """Make the tiles' lists, as gsplat's `isect_tiles` and `isect_offset_encode` do."""
-    (C, N), device = depths.shape, means2d.device
-    tile_width, tile_height = math.ceil(width / TILE_SIZE), math.ceil(height / TILE_SIZE)
+    C, N = depths.shape
+    device = means2d.device
+    tile_width = math.ceil(width / TILE_SIZE)
+    tile_height = math.ceil(height / TILE_SIZE)
     n_tiles = tile_width * tile_height
     grid = torch.tensor([tile_width, tile_height], device=device)
     visible = (extents > 0).all(dim=-1)
     # gsplat divides before it adds; the same order rounds to the same tiles.
-    centers, reach = means2d / TILE_SIZE, extents / TILE_SIZE
+    centers = means2d / TILE_SIZE
+    reach = extents / TILE_SIZE
     low = (centers - reach).floor().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)  # [C, N, 2]
     high = (centers + reach).ceil().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)
     spans = (high - low) * visible[..., None]
@@ -190,7 +198,8 @@ class _Composite(torch.autograd.Function):
                 starts.append(transmittance)
             ctx.starts.append(starts)
         ctx.save_for_backward(means2d, conics, colors, opacities, canvas)
-        ctx.tiles, ctx.absgrad = tiles, absgrad
+        ctx.tiles = tiles
+        ctx.absgrad = absgrad
         return canvas
 
     @staticmethod
@@ -271,7 +280,10 @@ def _segment_gradients(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`."""
-    dx, dy, alphas, weights = segment.dx, segment.dy, segment.alphas, segment.weights
+    dx = segment.dx
+    dy = segment.dy
+    alphas = segment.alphas
+    weights = segment.weights
     a, b, c = segment.conics
     dots = v_colors @ colors.mT  # [B, S * S, L]
     shares = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)
@@ -282,13 +294,16 @@ def _segment_gradients(
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
     # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
-    columns, rows = v_sigmas.sum(dim=1, keepdim=True), v_sigmas.sum(dim=2, keepdim=True)  # [B, 1, S, L], [B, S, 1, L]
+    columns = v_sigmas.sum(dim=1, keepdim=True)  # [B, 1, S, L]
+    rows = v_sigmas.sum(dim=2, keepdim=True)  # [B, S, 1, L]
     mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
     total, mx, my, mxx, mxy, myy = (
         moment.sum(dim=(1, 2))
         for moment in (rows, columns * dx, rows * dy, columns * dx * dx, mixed * dy, rows * dy * dy)
     )  # [B, L]
-    a0, b0, c0 = a[:, 0, 0], b[:, 0, 0], c[:, 0, 0]
+    a0 = a[:, 0, 0]
+    b0 = b[:, 0, 0]
+    c0 = c[:, 0, 0]
     # alpha = opacity * exp(-sigma) wherever v_sigma is not zero, and then opacity >= _MIN_ALPHA.
     v_opacity = -total / segment.opacities.clamp_min(_MIN_ALPHA)
     columns_of = [a0 * mx + b0 * my, b0 * mx + c0 * my, 0.5 * mxx, mxy, 0.5 * myy, v_opacity]

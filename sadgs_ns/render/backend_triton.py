@@ -40,7 +40,8 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
         tiles = intersect_tiles(*ellipses, width, height, TILE_SIZE, options.max_off_axis)
     elif options.max_off_axis > 0:
         radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
-    degree, colors = options.sh_degree, gaussians.colors
+    degree = options.sh_degree
+    colors = gaussians.colors
     if isinstance(colors, tuple) and degree is not None and degree <= MAX_DEGREE and not differentiates_cameras:
         colors = colors_from_harmonics(degree, gaussians.means, *colors, viewmats, radii)
     else:

@@ -21,7 +21,8 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
 def world_to_camera(means: Tensor, covars: Tensor, viewmats: Tensor) -> tuple[Tensor, Tensor]:
     """Turn centres [N, 3] and covariances [N, 3, 3] into the axes of cameras [C, 4, 4]. [C, N, 3], [C, N, 3, 3]"""
-    rotations, translations = viewmats[:, :3, :3], viewmats[:, :3, 3]
+    rotations = viewmats[:, :3, :3]
+    translations = viewmats[:, :3, 3]
     centres = torch.einsum("cij,nj->cni", rotations, means) + translations[:, None, :]
     return centres, torch.einsum("cij,njk,clk->cnil", rotations, covars, rotations)
 
@@ -34,8 +35,13 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     """
     x, y, z = means.unbind(dim=-1)
     z2 = z**2
-    fx, fy, cx, cy = Ks[:, 0, 0, None], Ks[:, 1, 1, None], Ks[:, 0, 2, None], Ks[:, 1, 2, None]  # [C, 1]
-    margin_x, margin_y = FRUSTUM_MARGIN * (0.5 * width / fx), FRUSTUM_MARGIN * (0.5 * height / fy)
+    # [C, 1]
+    fx = Ks[:, 0, 0, None]
+    fy = Ks[:, 1, 1, None]
+    cx = Ks[:, 0, 2, None]
+    cy = Ks[:, 1, 2, None]
+    margin_x = FRUSTUM_MARGIN * (0.5 * width / fx)
+    margin_y = FRUSTUM_MARGIN * (0.5 * height / fy)
     x = z * torch.clamp(x / z, min=-(cx / fx + margin_x), max=(width - cx) / fx + margin_x)
     y = z * torch.clamp(y / z, min=-(cy / fy + margin_y), max=(height - cy) / fy + margin_y)
     zero = torch.zeros_like(z)
@@ -60,21 +66,28 @@ def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
 
 def _bases(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
     """Evaluate the basis of the harmonics at unit vectors; the order of operations decides how gradients round."""
-    along_z, along_x, along_y = 0.48860251190292 * z, -0.48860251190292 * x, -0.48860251190292 * y
+    along_z = 0.48860251190292 * z
+    along_x = -0.48860251190292 * x
+    along_y = -0.48860251190292 * y
     z2 = z * z
     tilt = -1.092548430592079 * z
     cos2 = x * x - y * y
     sin2 = 2 * x * y
     b6 = 0.9461746957575601 * z2 - 0.3153915652525201
-    b7, b5 = tilt * x, tilt * y
-    b8, b4 = 0.5462742152960395 * cos2, 0.5462742152960395 * sin2
+    b7 = tilt * x
+    b5 = tilt * y
+    b8 = 0.5462742152960395 * cos2
+    b4 = 0.5462742152960395 * sin2
     ring = -2.285228997322329 * z2 + 0.4570457994644658
     tilt = 1.445305721320277 * z
     cos3 = x * cos2 - y * sin2
     sin3 = x * sin2 + y * cos2
     b12 = z * (1.865881662950577 * z2 - 1.119528997770346)
-    b13, b11 = ring * x, ring * y
-    b14, b10 = tilt * cos2, tilt * sin2
-    b15, b9 = -0.5900435899266435 * cos3, -0.5900435899266435 * sin3
+    b13 = ring * x
+    b11 = ring * y
+    b14 = tilt * cos2
+    b10 = tilt * sin2
+    b15 = -0.5900435899266435 * cos3
+    b9 = -0.5900435899266435 * sin3
     b0 = torch.full_like(x, 0.2820947917738781)
     return [b0, along_y, along_z, along_x, b4, b5, b6, b7, b8, b9, b10, b11, b12, b13, b14, b15]

@@ -20,7 +20,8 @@ def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_o
     """
     # Numbers, not a tensor of them, which the host would have to send to the device.
     x, y = means2d.unbind(dim=-1)
-    half_width, half_height = width / 2, height / 2
+    half_width = width / 2
+    half_height = height / 2
     near = (x - half_width).abs() < max_off_axis * half_width
     near &= (y - half_height).abs() < max_off_axis * half_height  # [C, N]
     return radii * (near[..., None] if has_radius_per_axis(radii, means2d) else near)

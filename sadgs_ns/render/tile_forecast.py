@@ -48,7 +48,9 @@ class TileForecast:
     """
 
     def __init__(self) -> None:
-        self._epoch, self._num_gaussians = 0, -1  # Epochs end where the number of Gaussians changes.
+        # Epochs end where the number of Gaussians changes.
+        self._epoch = 0
+        self._num_gaussians = -1
         self._visits: dict[tuple[int, tuple[int, int]], _Visit] = {}
         self._changes: deque[tuple[int, float]] = deque(maxlen=RECENT)  # epoch of the visit before, and the factor
         self._calls: deque[_Call] = deque()
@@ -62,7 +64,8 @@ class TileForecast:
         view was never visited, no view was visited since a densification, or there are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
-            self._epoch, self._num_gaussians = self._epoch + 1, num_gaussians
+            self._epoch = self._epoch + 1
+            self._num_gaussians = num_gaussians
             self._changes.clear()
         total = 0.0
         for view in views:

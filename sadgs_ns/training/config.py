@@ -32,7 +32,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.render.rasterization import choose_backend
 from sadgs_ns.render.types import BackendName
-from sadgs_ns.training.options import check_ranges, hide
+from sadgs_ns.training.options import check_ranges, fill_missing, hide
 from sadgs_ns.training.run import processes
 from sadgs_ns.training.run.progress import ProgressTable
 from sadgs_ns.training.run.run_folder import begin
@@ -111,7 +111,10 @@ class SadgsModelConfig(InstantiateConfig):
 
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""
-        near, stereo, off_axis, angle = self.near_plane, self.stereo_points, self.max_off_axis, self.max_angular_scale
+        near = self.near_plane
+        stereo = self.stereo_points
+        off_axis = self.max_off_axis
+        angle = self.max_angular_scale
         ranges = [
             ("ssim_lambda", 0 <= self.ssim_lambda <= 1, "in [0, 1]"),
             ("background_color", self.background_color in ("black", "white"), "black or white"),
@@ -199,7 +202,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
 
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""
-        views, epsilon, budget = self.views_per_iteration, self.epsilon, self.memory_budget_gb
+        views = self.views_per_iteration
+        epsilon = self.epsilon
+        budget = self.memory_budget_gb
         ranges = [
             ("effort", 0 < self.effort <= MOST_EFFORT, f"in (0, {MOST_EFFORT}]"),
             ("views_per_iteration", views is None or views >= 1, "at least 1"),
@@ -314,12 +319,18 @@ class SadgsTrainerConfig(TrainerConfig):
             remedy = "leave these out, change them in the file, or give --load-dir with the run's folder instead"
             raise InputError(f"{problem}: {remedy}.")
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the values of a `config.yml` or a copy; options that an earlier version did not have get defaults."""
+        vars(self).update(state)
+        fill_missing(self)
+
     def print_to_terminal(self) -> None:
         """Print nothing. nerfstudio prints all options, which `config.yml` holds, before a run is known to start."""
 
     def check(self) -> None:
         """Raise InputError if training cannot work with these options, or if the device is not there."""
-        length, port = self.max_num_iterations, self.viewer.websocket_port
+        length = self.max_num_iterations
+        port = self.viewer.websocket_port
         periods = [f"steps_per_{what}" for what in ("save", "eval_batch", "eval_image", "eval_all_images")]
         accumulated = any(steps != 1 for steps in self.gradient_accumulation_steps.values())
         ranges = [
@@ -345,7 +356,8 @@ class SadgsTrainerConfig(TrainerConfig):
         if device == "cuda" and not torch.cuda.is_available():
             problem = "machine.device_type is cuda, but torch finds no CUDA device"
             raise InputError(f"{problem}: set it to cpu, or install torch for CUDA.")
-        model, several = self.pipeline.model, processes.check_devices(self.machine)
+        model = self.pipeline.model
+        several = processes.check_devices(self.machine)
         if model.backend != "auto":  # That is decided in the process that trains, where Triton tries a kernel.
             choose_backend(model.backend, torch.device(device), not several)
         if not several:
@@ -362,7 +374,9 @@ class SadgsTrainerConfig(TrainerConfig):
     def _check_rates(self) -> None:
         """Raise InputError if a learning rate ever leaves [0, 1], or a factor is not positive."""
         for group, configs in self.optimizers.items():
-            adam, rate, scheduler = configs["optimizer"], configs["optimizer"].lr, configs.get("scheduler")
+            adam = configs["optimizer"]
+            rate = configs["optimizer"].lr
+            scheduler = configs.get("scheduler")
             ranges = [  # One launch updates all parameters.
                 ("_target", adam._target is FusedAdam, "sadgs's Adam"),
                 ("max_norm", adam.max_norm is None, "left out"),

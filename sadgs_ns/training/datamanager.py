@@ -18,7 +18,8 @@ from torch import Tensor
 
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import splits
-from sadgs_ns.data.parsers import OWN, choose_parser
+from sadgs_ns.data.own_parsers import OWN
+from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.step.images import LazyImages, thread_count
 
@@ -37,7 +38,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         parser._target = OWN.get(parser._target, parser._target)
         config.dataparser = parser
         # nerfstudio would keep more than 500 images on the host, whatever their size.
-        requested, config.cache_images = config.cache_images, "cpu"
+        requested = config.cache_images
+        config.cache_images = "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = requested
         for dataset in (self.train_dataset, self.eval_dataset):
@@ -54,7 +56,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: str) -> Any:
         """Load the images of a split on the device or on the host, or return `LazyImages` if they stay compressed."""
-        device, dataset = torch.device(self.device), self.train_dataset if split == "train" else self.eval_dataset
+        device = torch.device(self.device)
+        dataset = self.train_dataset if split == "train" else self.eval_dataset
         images = LazyImages(dataset)
         self.train_cameras = self.train_dataset.cameras
         if cache_images_device == "compressed":
@@ -97,7 +100,8 @@ class _HeldOutViews(Sequence[tuple[Cameras, dict[str, Any]]]):
         return len(self.datamanager.eval_dataset)
 
     def __getitem__(self, index: Any) -> Any:
-        device, data = self.datamanager.device, self.datamanager.cached_eval[index]
+        device = self.datamanager.device
+        data = self.datamanager.cached_eval[index]
         camera = self.datamanager.eval_dataset.cameras[index : index + 1].to(device)
         return camera, {**data, "image": data["image"].to(device)}
 

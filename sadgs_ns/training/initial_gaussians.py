@@ -28,20 +28,24 @@ def initial_gaussians(
         start = starting_points(points, torch.rand((len(points), 3)), faces=False)
         sfm = 0
     else:
-        points, colors = seed_points[0].float(), seed_points[1].float() / 255.0
+        points = seed_points[0].float()
+        colors = seed_points[1].float() / 255.0
         plausible = plausible_points(points)  # [P]
         if not plausible.all():
             told = f"Leaving out {int((~plausible).sum())} of {len(points)} SfM points"
             warn(f"{told}, which are not finite or more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them.")
-            points, colors = points[plausible], colors[plausible]
+            points = points[plausible]
+            colors = colors[plausible]
         start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
         sfm = len(points)
-    means, cap = start[0], config.strategy.max_gaussians
+    means = start[0]
+    cap = config.strategy.max_gaussians
     synthetic = torch.arange(len(means)) >= sfm
     if len(means) > cap:
         warn(f"Keeping a random {cap} of {len(means)} initial points: max_gaussians is {cap}.")
         keep = torch.randperm(len(means))[:cap]
-        start, synthetic = tuple(values[keep] for values in start), synthetic[keep]
+        start = tuple(values[keep] for values in start)
+        synthetic = synthetic[keep]
     return spheres(*start, sh_degree=config.sh_degree), synthetic
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
 from torch import Tensor
@@ -19,23 +20,22 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
 from sadgs_ns.geometry.initialization import camera_extent, neighbour_scales
-from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
-from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.losses import photometric_loss
-from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.running_strategy import RunningStrategy
+from sadgs_ns.method.strategy import DEFAULT_ITERATIONS
 from sadgs_ns.render.activations import activate
+from sadgs_ns.render.normals import normals_map
 from sadgs_ns.render.rasterization import choose_backend, rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.parameter_average import RunningMean
-from sadgs_ns.viewer import maps
-from sadgs_ns.viewer.elements import LazyOutputs, in_viewer, warn_once
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within this many of their standard deviations of a camera are dropped, unlike in the paper. That
@@ -49,14 +49,15 @@ class SadgsModel(SplatfactoModel):
     """The Gaussians, their rendering and their loss; nerfstudio's other programs see a splatfacto model."""
 
     config: SadgsModelConfig
-    strategy: StructureAwareStrategy
+    strategy: RunningStrategy
+    plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
         config = self.config
         config.check()
-        self.strategy = config.strategy
+        self.strategy = config.strategy.for_run(DEFAULT_ITERATIONS)  # Until `follow` sets that of the run.
         self.strategy_state = self.strategy.initialize_state()
         params, self.synthetic = initial_gaussians(config, self.seed_points)
         """Tell which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]"""
@@ -67,8 +68,6 @@ class SadgsModel(SplatfactoModel):
         self.step = 0
         self.average = RunningMean()
         self.camera_positions: Tensor | None = None  # [C, 3]
-        self.near_plane = config.near_plane or NEAR_PLANE
-        self.infos: list[dict[str, Any]] = []
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
         self.crop_box: OrientedBox | None = None
@@ -80,9 +79,9 @@ class SadgsModel(SplatfactoModel):
             self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
     def set_cameras(self, cameras: Cameras) -> None:
-        """Set extent, initial Gaussians and near plane for the training cameras; call before optimizers are made."""
+        """Set the extent and drop Gaussians that are too close to a camera; call before optimizers are made."""
         positions = camera_positions(cameras)
-        self.strategy_state["scene_scale"] = extent = camera_extent(positions)
+        self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
         radii = CAMERA_CLEARANCE * self.scales.detach().exp().amax(dim=1)  # [N]
         keep = camera_distances(self.means.detach(), self.camera_positions, radii) >= radii
@@ -90,37 +89,37 @@ class SadgsModel(SplatfactoModel):
             for parameter in self.gauss_params.values():
                 parameter.data = parameter.data[keep]
             self.synthetic = self.synthetic[keep.cpu()]
-        if self.config.near_plane is None:
-            points = self.means.new_zeros((0, 3)) if self.seed_points is None else self.seed_points[0].to(self.means)
-            viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
-            sizes = torch.cat([cameras.width, cameras.height], dim=-1)
-            self.near_plane = scene_near_plane(points, viewmats, cameras.get_intrinsics_matrices(), sizes, extent)
 
     def add_points(self, means: Tensor, colors: Tensor, scales: Tensor) -> int:
         """Start from more points, as many as the cap allows; call before optimizers are made. Return their number.
 
         Means [P, 3], colours in [0, 1] [P, 3] and largest standard deviations [P], which neighbours also limit.
         """
-        room = max(min(len(means), self.strategy.max_gaussians - self.num_points), 0)
+        room = max(min(len(means), self.strategy.options.max_gaussians - self.num_points), 0)
         if not room:
             return 0
         known = self.means.detach()[~self.synthetic.to(self.means.device)]
-        means, scales = means[:room], scales[:room]
+        means = means[:room]
+        scales = scales[:room]
         spacing = neighbour_scales(torch.cat([known, means.to(known)]))[len(known) :]  # [room]
-        scales, opacity = torch.minimum(scales, spacing.to(scales)), self.config.initial_opacity
+        scales = torch.minimum(scales, spacing.to(scales))
+        opacity = self.config.initial_opacity
         added = spheres(means, colors[:room], scales, opacity, sh_degree=self.config.sh_degree)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.cat([parameter.data, added[name].to(parameter)])
         self.synthetic = torch.cat([self.synthetic, torch.zeros(room, dtype=torch.bool)])
         return room
 
-    def clear_paths(self, viewmats: Tensor) -> None:
-        """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it."""
+    def clear_paths(self, viewmats: Tensor, near_plane: float) -> None:
+        """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it.
+
+        `near_plane` is the depth from which Gaussians will be drawn.
+        """
         if self.config.clear_paths:
             surfaces = self.means.detach()[~self.synthetic.to(self.device)]
             if self.seed_points is not None:  # From those near cameras no Gaussian starts.
                 surfaces = torch.cat([surfaces, self.seed_points[0].to(surfaces)])
-            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, self.near_plane, surfaces)
+            self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, near_plane, surfaces)
 
     def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
@@ -138,14 +137,24 @@ class SadgsModel(SplatfactoModel):
 
     def follow(self, plan: RunPlan) -> None:
         """From now on, densify, average and draw according to a plan."""
-        self.plan, self.near_plane = plan, plan.near_plane
+        self.plan = plan
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
 
-    def step_post_backward(self, step: int) -> None:
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Return the callback that nerfstudio calls before a step.
+
+        After a step, the pipeline calls `step_post_backward`, because it has the step's infos.
+        """
+        before_step, _ = super().get_training_callbacks(training_callback_attributes)
+        return [before_step]
+
+    def step_post_backward(self, step: int, infos: Sequence[dict[str, Any]] = ()) -> None:
         """Densify, prune haze and limit scales if that is due, and average the parameters at the run's end."""
-        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, self.infos)
-        self.infos = []
-        iterations, done = self.plan.iterations, self.step + 1
+        self.strategy.densify(self.gauss_params, self.optimizers, self.strategy_state, self.step, infos)
+        iterations = self.plan.iterations
+        done = self.step + 1
         before_mean = iterations - round(self.config.averaged_share * iterations) - done
         if before_mean >= 0:
             self.average.clear()  # A run that is trained on may have begun to average earlier.
@@ -155,7 +164,8 @@ class SadgsModel(SplatfactoModel):
             self.average.add(self.gauss_params)
             if done >= iterations:
                 self.average.move_to(self.gauss_params)
-        share, positions = self.config.max_angular_scale, self.camera_positions
+        share = self.config.max_angular_scale
+        positions = self.camera_positions
         if share > 0 and positions is not None and (done % LIMIT_EVERY == 0 or done >= iterations):
             limit_scales(self.scales, self.means, positions, share)
 
@@ -177,12 +187,24 @@ class SadgsModel(SplatfactoModel):
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
 
-    def cropped(self, values: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
-        """Return the rows of tensors [N, …] of Gaussians in the viewer's crop box; in training, all rows."""
+    def shown_rows(self, chosen: Tensor | None = None) -> Tensor | None:
+        """Return which Gaussians are drawn: the chosen ones that lie in the viewer's crop box. bool [N]
+
+        None stands for all Gaussians, in the argument and in the result. In training, the box hides nothing.
+        """
         if self.crop_box is None or self.training:
-            return values
+            return chosen
         inside = self.crop_box.within(self.means)
-        return {name: value[inside] for name, value in values.items()}
+        if chosen is None:
+            return inside
+        return chosen & inside
+
+    def cropped(self, values: Mapping[str, Tensor], chosen: Tensor | None = None) -> Mapping[str, Tensor]:
+        """Return the rows of tensors [N, …] of the Gaussians that are drawn, as `shown_rows` chooses them."""
+        rows = self.shown_rows(chosen)
+        if rows is None:
+            return values
+        return {name: value[rows] for name, value in values.items()}
 
     @property
     def backend(self) -> str:
@@ -192,8 +214,9 @@ class SadgsModel(SplatfactoModel):
     @property
     def drawing(self) -> RenderOptions:
         """The options that all pictures of these Gaussians share; `color_options` are for colours."""
-        config = self.config
-        return RenderOptions(near_plane=self.near_plane, max_off_axis=config.max_off_axis, backend=config.backend)
+        return RenderOptions(
+            near_plane=self.plan.near_plane, max_off_axis=self.plan.max_off_axis, backend=self.config.backend
+        )
 
     def color_options(self, **changes: Any) -> RenderOptions:
         """Return the options to draw colours at this step, with other values of some fields."""
@@ -201,22 +224,28 @@ class SadgsModel(SplatfactoModel):
         degree = min(self.step, self.config.sh_degree) if self.config.sh_degree > 0 else None
         return replace(self.drawing, sh_degree=degree, **changes)
 
-    def render(self, cameras: Pinholes, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    def render(
+        self, cameras: Pinholes, options: RenderOptions, chosen: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
         """Rasterize the Gaussians, in the viewer those inside its crop box, in their colours.
 
-        Returns unclamped colours, with depth if `options` ask for it [C, H, W, 3 or 4], accumulated opacity
-        [C, H, W, 1], and the rasterizer's info.
+        `chosen`, bool [N], leaves out all others. Returns unclamped colours, with depth if `options` ask for it
+        [C, H, W, 3 or 4], accumulated opacity [C, H, W, 1], and the rasterizer's info.
         """
-        return rasterize(self.gaussians()[0], cameras, options)
+        gaussians, _ = self.gaussians(chosen=chosen)
+        return rasterize(gaussians, cameras, options)
 
     def gaussians(
-        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0
+        self, params: Mapping[str, Tensor] | None = None, opacity_reg: float = 0.0, chosen: Tensor | None = None
     ) -> tuple[Gaussians, Tensor | None]:
         """Return the activated Gaussians inside the viewer's crop box, of `params` or the model's own.
 
-        The second result are numbers [P] whose sum is the mean opacity times `opacity_reg`; None if that factor is 0.
+        `chosen`, bool [N], leaves out all others. The second result are numbers [P] whose sum is the mean opacity
+        times `opacity_reg`; None if that factor is 0.
         """
-        params = self.cropped(dict(self.gauss_params.items()) if params is None else params)
+        if params is None:
+            params = dict(self.gauss_params.items())
+        params = self.cropped(params, chosen)
         colors: Tensor | tuple[Tensor, Tensor] = (params["features_dc"], params["features_rest"])
         if self.config.sh_degree == 0:
             colors = torch.sigmoid(params["features_dc"])  # [N, 3]
@@ -225,7 +254,8 @@ class SadgsModel(SplatfactoModel):
 
     def step_options(self, cameras: Pinholes, indices: Sequence[int]) -> RenderOptions:
         """Return how training views, by their indices, are drawn at this step, with the foreseen length of lists."""
-        forecast, capacity = self.tile_forecast, None
+        forecast = self.tile_forecast
+        capacity = None
         if forecast is not None:
             capacity = forecast.capacity(indices, cameras[2:], self.num_points)
         return self.color_options(absgrad=self.strategy.needs_absgrad(self.step), tile_capacity=capacity)
@@ -241,18 +271,24 @@ class SadgsModel(SplatfactoModel):
             return render[..., :3]
         return render[..., :3] + (1 - alpha) * background
 
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:
+    def get_outputs(self, camera: Cameras, chosen: Tensor | None = None) -> dict[str, Any]:
         """Render one camera, shape [1], for viewer and evaluation. Raise InputError if it is no pinhole.
+
+        Args:
+            camera: The camera.
+            chosen: Which Gaussians to draw; those outside the viewer's crop box are left out anyway. bool [N]
 
         Returns:
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
         """
         check_camera_types(camera)
-        pinhole, background = self.pinhole(camera), self.background
-        if self.crop_box is not None and not self.crop_box.within(self.means).any():
+        pinhole = self.pinhole(camera)
+        background = self.background
+        rows = self.shown_rows(chosen)
+        if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
-        render, alpha, _ = self.render(pinhole, self.color_options(expected_depth=True))
+        render, alpha, _ = self.render(pinhole, self.color_options(expected_depth=True), chosen)
         depth = render[..., 3:4]
         return {
             "rgb": (render[..., :3] + (1 - alpha) * background).clamp(0.0, 1.0)[0],
@@ -271,14 +307,14 @@ class SadgsModel(SplatfactoModel):
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
         """Render the normals of one camera, shape [1], which takes about as long as its colours. [H, W, 3]
 
-        They are 0.5 + 0.5 n with n of `maps.normals_map`, in the world's axes, and black where nothing is.
+        They are 0.5 + 0.5 n with n of `normals_map`, in the world's axes, and black where nothing is.
         `params` default to the model's own inside the viewer's crop box.
         """
         params = self.cropped(dict(self.gauss_params.items())) if params is None else params
         pinhole = self.pinhole(camera)
         if not len(params["means"]):
             return torch.zeros((pinhole.height, pinhole.width, 3), device=self.device)
-        normals = maps.normals_map(params, pinhole, self.drawing)
+        normals = normals_map(params, pinhole, self.drawing)
         return torch.where((normals != 0).any(dim=-1, keepdim=True), 0.5 + 0.5 * normals, 0.0)
 
     def get_outputs_for_camera(  # type: ignore[override]
@@ -318,6 +354,10 @@ class SadgsModel(SplatfactoModel):
             return alpha * image[..., :3] + (1 - alpha) * background
         return image
 
+    def photo(self, data: Mapping[str, Any]) -> Tensor:
+        """Return an image of the datamanager as the loss sees it: on the device and the background. [H, W, 3]"""
+        return self.composite_with_background(self.get_gt_img(data["image"]), self.background)
+
     def get_loss_dict(
         self, outputs: Mapping[str, Any], batch: Mapping[str, Any], metrics_dict: Mapping[str, Any] | None = None
     ) -> dict[str, Tensor]:
@@ -337,7 +377,8 @@ class SadgsModel(SplatfactoModel):
             target = self.composite_with_background(self.get_gt_img(target), background)
         if "mask" in batch:
             mask = batch["mask"].to(self.device)
-            target, rgb = target * mask, rgb * mask
+            target = target * mask
+            rgb = rgb * mask
         return rgb, target
 
     def psnr(self, predicted: Tensor, target: Tensor) -> Tensor:

@@ -1,9 +1,10 @@
-"""Hide options from `--help`, and check the ranges of their values."""
+"""Hide options from `--help`, check the ranges of their values, and fit those of other versions to this one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import TypeVar, get_type_hints
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, TypeVar, get_type_hints
 
 from tyro.conf import Suppress
 
@@ -33,3 +34,44 @@ def check_ranges(prefix: str, options: object, ranges: Iterable[tuple[str, bool,
             value = getattr(options, name)
             got = f"{value:g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
             raise InputError(f"{prefix}{name} must be {allowed}, got {got}.")
+
+
+def fill_missing(options: Any) -> None:
+    """Give options their defaults where they have no value, as those that an earlier version wrote to `config.yml`.
+
+    A class of options gives its instances plain defaults, but not those that a `default_factory` makes.
+    """
+    for _, part in _nested(options):
+        values = vars(part)
+        for field in fields(part):
+            if field.name in values:
+                continue
+            if field.default is not MISSING:
+                values[field.name] = field.default
+            elif field.default_factory is not MISSING:
+                values[field.name] = field.default_factory()
+
+
+def drop_unknown(options: Any) -> list[str]:
+    """Remove options that this version does not have, and return their names, such as "pipeline.model.sh_degree"."""
+    dropped = []
+    for prefix, part in _nested(options):
+        known = {field.name for field in fields(part)}
+        values = vars(part)
+        for name in [name for name in values if name not in known and not name.startswith("_")]:
+            del values[name]
+            dropped.append(prefix + name)
+    return dropped
+
+
+def _nested(options: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield options and all options inside them, dataclasses all, each after what precedes their names."""
+    if is_dataclass(options) and not isinstance(options, type):
+        yield prefix, options
+        inside = {field.name: getattr(options, field.name, None) for field in fields(options)}
+    elif isinstance(options, Mapping):  # such as those of the optimizers, by groups of parameters
+        inside = options
+    else:
+        return
+    for name, value in inside.items():
+        yield from _nested(value, f"{prefix}{name}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
-from sadgs_ns.data.parsers import findings_of
+from sadgs_ns.data.checks.capture import findings_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -24,15 +25,16 @@ from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.run.memory_plan import choose_image_storage
 from sadgs_ns.training.run.progress import note, warn
-from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.run.run_plan import RunPlan, unknown_fields
 from sadgs_ns.training.step import nonfinite
 from sadgs_ns.training.step.images import stack
 from sadgs_ns.training.step.nonfinite import NonFiniteLog
-from sadgs_ns.training.step.structure_cache import StructureCache
+from sadgs_ns.training.step.structure_cache import StructureCache, observe_training_views
 from sadgs_ns.training.step.train_step import StepResult, ViewGroup
 from sadgs_ns.training.step.views import TrainingViews
 from sadgs_ns.viewer.cleaning_panel import CleaningPanel
 from sadgs_ns.viewer.elements import shows_output
+from sadgs_ns.viewer.shown_run import ShownRun
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
 _NAMED_STEPS = 5  # Number of iterations whose images a report of losses that are not finite names
@@ -57,25 +59,53 @@ class SadgsPipeline(VanillaPipeline):
         for dataset in (self.datamanager.train_dataset, self.datamanager.eval_dataset):
             check_camera_types(dataset.cameras)
         loads_images = config.datamanager.cache_images != "compressed" and kwargs.get("test_mode") != "inference"
-        if loads_images and (line := choose_image_storage(self.datamanager, self.device)):
-            note(line)
+        if loads_images:
+            storage = choose_image_storage(self.datamanager, self.device)
+            self.datamanager.config.cache_images = storage.where  # type: ignore[assignment]
+            if storage.sentence:
+                note(storage.sentence)
         parsed_on = getattr(self.datamanager.dataparser.config, "alpha_color", None)
         if parsed_on is not None and parsed_on != config.model.background_color:
-            told = f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}"
-            warn(f"{told}: consider --pipeline.model.background-color {parsed_on}.")
+            warn(
+                f"The images were put on {parsed_on}, the Gaussians lie on {config.model.background_color}: consider "
+                f"--pipeline.model.background-color {parsed_on}."
+            )
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
         self.model.set_cameras(self.datamanager.train_dataset.cameras)
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_cache = StructureCache(
-            self.views, config.frequency_constant, energy_blur=config.energy_blur, epsilon=config.epsilon
+            self.views,
+            self.device,
+            self.model.photo,
+            config.frequency_constant,
+            energy_blur=config.energy_blur,
+            epsilon=config.epsilon,
         )
         self.log = NonFiniteLog(self.device)
+        self._infos: list[dict[str, Any]] = []  # The rasterizer's, of the last step until densification has read them
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
         self.diverged = ""  # a sentence with the reason once nothing is learned any more
-        self.structure = StructurePanel(self.structure_cache)
-        self.cleaning = CleaningPanel(self.views)
+        shown_run = ShownRun(
+            model=self.model,
+            datamanager=self.datamanager,
+            structure_tensors=self.structure_cache,
+            view_cameras=self._view_cameras,
+            observe=partial(observe_training_views, self.structure_cache),
+            warn=warn,
+        )
+        self.structure = StructurePanel(shown_run)
+        self.cleaning = CleaningPanel(shown_run)
         self.model.viewer_outputs = self._viewer_outputs
+
+    def _view_cameras(self) -> list[Pinholes]:
+        """Return the camera of each training view, with the pose that is learned so far."""
+        _, Ks = self.views.cameras
+        cameras = []
+        for index, (height, width) in enumerate(self.views.sizes):
+            viewmat = self.views.viewmat(index).detach()
+            cameras.append(Pinholes(viewmat[None], Ks[index][None], width, height))
+        return cameras
 
     def _viewer_outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the panels' pictures and normals, which cannot be lazy while training changes the Gaussians."""
@@ -91,36 +121,55 @@ class SadgsPipeline(VanillaPipeline):
 
     def train(self, mode: bool = True) -> SadgsPipeline:
         """Set the mode of all modules, unless they have it; nerfstudio calls this before every step."""
-        return self if mode == self.training == self.model.training else super().train(mode)
+        if mode == self.training == self.model.training:
+            return self
+        return super().train(mode)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Return the callbacks of data and model, and those that report and refresh the panel."""
-        step_end, run_end = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
-        counts = TrainingCallback([step_end, run_end], lambda step: self.structure.refresh())
-        read = TrainingCallback([step_end], lambda step: self._report_nonfinite() if self.log.full else None)
-        last = TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True))
+        """Return the callbacks of data and model, and those that report, densify and refresh the panel, in order."""
+        step_end = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        run_end = TrainingCallbackLocation.AFTER_TRAIN
         # The log is read before densification makes new parameters, which have no gradients.
-        return [read, *super().get_training_callbacks(training_callback_attributes), counts, last]
+        return [
+            TrainingCallback([step_end], lambda step: self._report_nonfinite_if_full()),
+            *super().get_training_callbacks(training_callback_attributes),
+            TrainingCallback([step_end], self._densify),
+            TrainingCallback([step_end, run_end], lambda step: self.structure.refresh()),
+            TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True)),
+        ]
 
-    def check_visibility(self) -> None:
+    def _densify(self, step: int) -> None:
+        """Let the model densify after a step, and drop the step's infos, which hold large tensors."""
+        self.model.step_post_backward(step, self._infos)
+        self._infos = []
+
+    def _report_nonfinite_if_full(self) -> None:
+        if self.log.full:
+            self._report_nonfinite()
+
+    def clear_paths(self, near_plane: float) -> None:
+        """Let densification prune haze near the training cameras' paths, as `SadgsModel.clear_paths` says."""
+        cameras = self.datamanager.train_dataset.cameras
+        self.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds), near_plane)
+
+    def check_visibility(self, near_plane: float) -> None:
         """Raise InputError if fewer than 1 % of the Gaussians lie between the near and the far plane of any camera."""
         cameras = self.datamanager.train_dataset.cameras
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds[:: -(-len(cameras) // _SAMPLED)])
         means = self.model.means.detach()
         means = means[:: -(-len(means) // _SAMPLED)].to(viewmats)  # [N, 3]
         depths = means @ viewmats[:, 2, :3].T + viewmats[:, 2, 3]  # [N, C]
-        near = self.model.near_plane
-        drawn = ((depths > near) & (depths < FAR_PLANE)).any(dim=1)
+        drawn = ((depths > near_plane) & (depths < FAR_PLANE)).any(dim=1)
         world = self.model.world
         share = world.sum(drawn.float().mean().to(world.device)) / world.num_ranks
         if share < 0.01:
             extent = float(self.model.strategy_state["scene_scale"])
             raise InputError(
-                f"The renderings would be empty, since a camera sees from {near:.2g} to {FAR_PLANE:g} units and the "
-                f"cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, or "
-                "leave its auto-scale-poses on."
+                f"The renderings would be empty, since a camera sees from {near_plane:.2g} to {FAR_PLANE:g} units and "
+                f"the cameras lie within {extent:.2g}: set the parser's scale-factor so that they lie within about 1, "
+                "or leave its auto-scale-poses on."
             )
 
     def _report_nonfinite(self, last: bool = False) -> None:
@@ -136,8 +185,11 @@ class SadgsPipeline(VanillaPipeline):
             warn(f"Iteration {step + 1}, {names}: {problem}; such gradients counted as 0, training goes on.")
         if len(problems) > _NAMED_STEPS:
             warn(f"The same in {len(problems) - _NAMED_STEPS} more of the last iterations.")
-        enough = nonfinite.DIVERGED_STEPS if not last else min(nonfinite.DIVERGED_STEPS, self.log.steps)
-        lasts, gradient = bool(problems) and self.log.streak >= enough, self._means_gradient
+        enough = nonfinite.DIVERGED_STEPS
+        if last:
+            enough = min(enough, self.log.steps)
+        lasts = bool(problems) and self.log.streak >= enough
+        gradient = self._means_gradient
         if self.model.world.all(lasts and gradient is not None and nonfinite.has_no_update(gradient)):
             step, _, problem = problems[-1]
             names = [files[view].name for view in dict.fromkeys(view for _, views, _ in problems for view in views)]
@@ -150,8 +202,8 @@ class SadgsPipeline(VanillaPipeline):
     def _repeat_overflowed(self, *, wait: bool = False) -> None:
         """Requeue the views that were not drawn because their tile lists were longer than foreseen."""
         forecast = self.model.tile_forecast
-        if forecast is not None and (lost := forecast.overflowed(wait=wait)):
-            self.views.sampler.requeue(lost)
+        if forecast is not None:
+            self.views.sampler.requeue(forecast.overflowed(wait=wait))
 
     def next_views(self, step: int) -> list[ViewGroup]:
         """Draw the views of a step, bring their images to the device, and group them by their sizes."""
@@ -159,12 +211,18 @@ class SadgsPipeline(VanillaPipeline):
         model = self.model
         groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         for index, data in self.views.draw(model.plan.views_per_iteration):
-            # With several processes, this one loads only the images that it composites.
-            groups[data["image"].shape if model.world.alone else self.views.sizes[index]].append((index, data))
+            if model.world.alone:
+                size = data["image"].shape
+            else:
+                size = self.views.sizes[index]  # This process loads only the images that it composites.
+            groups[size].append((index, data))
         result = []
         for (height, width, *_), views in groups.items():
-            indices, data = [index for index, _ in views], [data for _, data in views]
-            quantized = stack(self.structure_cache.get(views)) if model.strategy.observes(step) else None
+            indices = [index for index, _ in views]
+            data = [data for _, data in views]
+            quantized = None
+            if model.strategy.observes(step):
+                quantized = stack(self.structure_cache.get(views, model.world))
             cameras = Pinholes(*self.views.stacked_cameras(indices), width, height)
             options = model.step_options(cameras, indices)
             result.append(ViewGroup(indices, cameras, options, data, model.view_ids(indices), quantized))
@@ -172,12 +230,14 @@ class SadgsPipeline(VanillaPipeline):
 
     def finish_step(self, step: int, groups: list[ViewGroup], result: StepResult) -> None:
         """Keep what later steps and reports need, without waiting for the device."""
-        self.model.infos, self._means_gradient = result.infos, result.means_gradient
+        self._infos = result.infos
+        self._means_gradient = result.means_gradient
         self.log.record(step, [index for group in groups for index in group.indices], result.loss)
         forecast = self.model.tile_forecast
         for group, info in zip(groups, result.infos, strict=True):
             if forecast is not None and "pair_counts" in info:  # Only our kernels count pairs.
-                size, capacity = group.cameras[2:], group.options.tile_capacity
+                size = group.cameras[2:]
+                capacity = group.options.tile_capacity
                 forecast.rendered(group.indices, size, capacity, info["pair_counts"])
 
     def get_average_eval_image_metrics(
@@ -226,8 +286,16 @@ class SadgsPipeline(VanillaPipeline):
         return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Restore what `get_extra_state` saved; the order of the views only if their number is the same."""
-        self.follow(RunPlan.of(state["plan"]))
+        """Restore what `get_extra_state` saved; the order of the views only if their number is the same.
+
+        A warning names the fields of the plan that another version wrote and this one does not have.
+        """
+        plan = RunPlan.of(state["plan"])
+        unknown = unknown_fields(state["plan"])
+        if unknown:
+            problem = "The checkpoint's plan has options that this version of sadgs does not have"
+            warn(f"{problem}; they are ignored: {', '.join(unknown)}.")
+        self.follow(plan)
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":

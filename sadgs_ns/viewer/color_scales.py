@@ -1,7 +1,7 @@
 """Colour scales, their legends, and pictures with a scale beside them.
 
-The colour maps are those of matplotlib that colour-blind readers can tell apart. It takes a third of a second to
-import, and training needs it only where a viewer shows it, so functions import it.
+The colour maps are those of matplotlib that colour-blind readers can tell apart. Importing matplotlib takes a third of
+a second, and training needs it only while a viewer shows a map. So the functions here import it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Scale:
         """Maps values to [0, 1]; values beyond the ends get the colours of the ends."""
         from matplotlib.colors import LogNorm, Normalize
 
-        return (LogNorm if self.log else Normalize)(self.low, self.high, clip=True)
+        if self.log:
+            return LogNorm(self.low, self.high, clip=True)
+        return Normalize(self.low, self.high, clip=True)
 
     @property
     def colormap(self) -> Colormap:
@@ -59,8 +61,9 @@ class Scale:
 
     def __call__(self, values: Tensor) -> Picture:
         """Colour a map of values in the scale's unit; NaN becomes black. [H, W] → [H, W, 3]"""
-        shown = self.norm(np.ma.masked_invalid(values.detach().float().cpu().numpy()))
-        return self.colormap(shown, bytes=True)[..., :3]  # type: ignore[return-value]
+        known = np.ma.masked_invalid(values.detach().float().cpu().numpy())
+        rgba: Any = self.colormap(self.norm(known), bytes=True)  # [H, W, 4]
+        return rgba[..., :3]
 
 
 PERIOD = Scale("period of the texture", "viridis", 3, 60, (3, 5, 10, 20, 40), unit="px")
@@ -72,14 +75,16 @@ LOW = Scale("share of consistently low Gaussians", "cividis", 0, 1, (0, 0.25, 0.
 
 def to_picture(image: Tensor) -> Picture:
     """Return an image, clamped to [0, 1], as a picture. [H, W, 3]"""
-    return (255 * image.detach().float().clamp(0, 1)).round().byte().cpu().numpy()
+    clamped = image.detach().float().clamp(0, 1)
+    return (255 * clamped).round().byte().cpu().numpy()
 
 
 def legend(text: str, scale: Scale | None = None) -> str:
-    """Return Markdown of a line of text and, if a scale is given, of an image of its colours and numbers."""
+    """Return Markdown with a line of text and, if a scale is given, an image of its colours and numbers."""
     if scale is None:
         return text
-    return f"{text}\n\n![{scale.label}](data:image/png;base64,{base64.b64encode(bar(scale)).decode()})"
+    png = base64.b64encode(bar(scale)).decode()
+    return f"{text}\n\n![{scale.label}](data:image/png;base64,{png})"
 
 
 @lru_cache(maxsize=8)
@@ -96,11 +101,12 @@ def bar(scale: Scale) -> bytes:
 
 
 def _add_bar(figure: Figure, scale: Scale, **place: Any) -> Colorbar:
-    """Add a bar of colours to a figure, with `place` as `Figure.colorbar` takes it."""
+    """Add a bar of colours to a figure; `place` holds arguments of `Figure.colorbar` that say where."""
     from matplotlib.cm import ScalarMappable
 
-    form = f"%.2g {scale.unit}".rstrip()
-    added = figure.colorbar(ScalarMappable(scale.norm, scale.colormap), ticks=scale.ticks, format=form, **place)
+    colored = ScalarMappable(scale.norm, scale.colormap)
+    number_format = f"%.2g {scale.unit}".rstrip()
+    added = figure.colorbar(colored, ticks=scale.ticks, format=number_format, **place)
     added.minorticks_off()
     return added
 
@@ -115,16 +121,16 @@ class Panel:
 
 
 def draw(path: Path, panels: Sequence[Panel], columns: int) -> None:
-    """Write pictures, at least one, with titles and colour bars in rows of `columns` as PNG, or raise WriteError."""
+    """Write pictures with titles and colour bars, in rows of `columns`, as a PNG; raise WriteError if it fails.
+
+    There must be a picture, and the first one's shape is that of the places for all.
+    """
     from matplotlib.figure import Figure
 
     rows = math.ceil(len(panels) / columns)
-    height, width = panels[0].picture.shape[:2]
-    side = 8.0 if len(panels) == 1 else 4.5
-    bar_width = 1.2 if any(panel.scale is not None for panel in panels) else 0.0
-    size = (columns * (side + bar_width), rows * (side * height / width + 0.35))
-    figure = Figure(figsize=size, layout="compressed")
-    for axes, panel in zip(figure.subplots(rows, columns, squeeze=False).flat, panels, strict=False):
+    figure = Figure(figsize=_figure_size(panels, rows, columns), layout="compressed")
+    places = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, panel in zip(places, panels, strict=False):  # The last row may have more places than pictures.
         axes.imshow(panel.picture, interpolation="nearest")
         axes.set_title(panel.title, fontsize=10)
         axes.set_axis_off()
@@ -132,3 +138,17 @@ def draw(path: Path, panels: Sequence[Panel], columns: int) -> None:
             _add_bar(figure, panel.scale, ax=axes).set_label(panel.scale.label)
     with atomic_path(path) as partial:
         figure.savefig(partial, dpi=100, metadata={"Software": None})
+
+
+def _figure_size(panels: Sequence[Panel], rows: int, columns: int) -> tuple[float, float]:
+    """Return width and height in inches of a figure with rows of pictures; a single picture is drawn larger."""
+    height, width = panels[0].picture.shape[:2]
+    picture_width = 4.5
+    if len(panels) == 1:
+        picture_width = 8.0
+    bar_width = 0.0
+    if any(panel.scale is not None for panel in panels):
+        bar_width = 1.2
+    title_height = 0.35
+    picture_height = picture_width * height / width
+    return columns * (picture_width + bar_width), rows * (picture_height + title_height)

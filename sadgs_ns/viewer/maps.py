@@ -1,7 +1,8 @@
-"""Maps of the Gaussians' η, children, normals and chosen shares, and pictures of S̄: its period, and S̄⁻¹ as ellipses.
+"""Maps of the Gaussians' η, children and chosen shares, and pictures of S̄: its period, and S̄⁻¹ as ellipses.
 
-`params` are means [N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1], by name. `camera` is a
-single one, and maps have its height and width. They are NaN where hardly anything with a value is drawn.
+Functions that draw N Gaussians take their raw parameters by name, `params`, as `render.blending.blend` does: means
+[N, 3], quats [N, 4], log scales [N, 3] and logit opacities [N] or [N, 1]. `camera` is a single one, and maps have its
+height and width. A map is NaN where hardly anything with a value is drawn.
 """
 
 from __future__ import annotations
@@ -13,72 +14,51 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-import torch.nn.functional as F
-from gsplat.utils import normalized_quat_to_rotmat
 from torch import Tensor
 
 from sadgs_ns.method.eta import WAVELENGTH_EPSILON, wavelength
 from sadgs_ns.method.split import num_children
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, NUM_LEVELS, SCALE_STEP
-from sadgs_ns.render.rasterization import rasterize
-from sadgs_ns.render.types import DEFAULTS, Cameras, Gaussians, RenderOptions
+from sadgs_ns.render.blending import blend
+from sadgs_ns.render.types import DEFAULTS, Cameras, RenderOptions
 from sadgs_ns.viewer.color_scales import PERIOD, Picture
 
 ELLIPSES_ACROSS = 28  # Number of ellipses along an image's shorter side
 MIN_COVER = 0.05  # Share of a pixel that Gaussians with a value must make up; otherwise the pixel counts as empty
-
-
-@torch.no_grad()
-def blend(
-    params: Mapping[str, Tensor], values: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
-) -> tuple[Tensor, Tensor]:
-    """Blend values [N, D] of the Gaussians like colours. → [H, W, D], and the covered share of each pixel [H, W, 1]"""
-    opacities = torch.sigmoid(params["opacities"].flatten())
-    gaussians = Gaussians(params["means"], params["quats"], params["scales"].exp(), opacities, values)
-    render, alpha, _ = rasterize(gaussians, camera, drawing)
-    return render[0], alpha[0]
+SUBPIXELS = 16  # OpenCV takes whole numbers of 1/16 px, so that a drawing need not snap to pixels
+SUBPIXEL_BITS = 4  # log2(SUBPIXELS)
 
 
 def mean_map(
     params: Mapping[str, Tensor], values: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
-    """Return the mean of the values [N], where NaN is none, of what is drawn at each pixel. [H, W]"""
-    weights = (~values.isnan()).to(values)
-    layers = torch.stack([values.nan_to_num(0.0), weights], dim=-1)
-    total, cover = blend(params, layers, camera, drawing)[0].unbind(-1)
+    """Return the mean of the values [N] of the Gaussians that are drawn at each pixel; NaN is no value. [H, W]"""
+    has_value = (~values.isnan()).to(values)  # [N]
+    layers = torch.stack([values.nan_to_num(0.0), has_value], dim=-1)  # [N, 2]
+    blended, _ = blend(params, layers, camera, drawing)  # [H, W, 2]
+    total, cover = blended.unbind(-1)
     return torch.where(cover > MIN_COVER, total / cover, torch.nan)
 
 
 def eta_map(
     params: Mapping[str, Tensor], statistics: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
-    """Return the geometric mean of the largest η of the Gaussians observed (`eta_max`, `n_total`). [H, W]"""
-    largest = statistics["eta_max"].amax(dim=1)
-    known = (statistics["n_total"] > 0) & (largest > 0)
-    return mean_map(params, torch.where(known, largest, torch.nan).log(), camera, drawing).exp()
+    """Return the geometric mean of the largest η of the Gaussians that were observed. [H, W]
+
+    `statistics` are those of `method.statistics`; of them, `eta_max` [N, 3] and `n_total` [N] are read.
+    """
+    largest = statistics["eta_max"].amax(dim=1)  # [N]
+    is_known = (statistics["n_total"] > 0) & (largest > 0)
+    log_eta = torch.where(is_known, largest, torch.nan).log()
+    return mean_map(params, log_eta, camera, drawing).exp()
 
 
 def children_map(
     params: Mapping[str, Tensor], counts: Tensor, camera: Cameras, drawing: RenderOptions = DEFAULTS
 ) -> Tensor:
     """Return the geometric mean of the Gaussians' numbers of children, ≥ 1 along each axis [N, 3]. [H, W]"""
-    return mean_map(params, num_children(counts).float().log(), camera, drawing).exp()
-
-
-@torch.no_grad()
-def normals_map(params: Mapping[str, Tensor], camera: Cameras, drawing: RenderOptions = DEFAULTS) -> Tensor:
-    """Return the blended normals of the Gaussians, of unit length in world axes, 0 where nothing is drawn. [H, W, 3]
-
-    A Gaussian's normal is the axis of its smallest scale, turned towards the camera. This is an estimate, because
-    training does not flatten Gaussians; normals of the depth map are rougher (docs/guide.md has both measured).
-    """
-    rotmats = normalized_quat_to_rotmat(F.normalize(params["quats"], dim=-1))  # [N, 3, 3]
-    thinnest = params["scales"].argmin(dim=1)[:, None, None].expand(-1, 3, 1)  # [N, 3, 1]
-    normals = rotmats.gather(2, thinnest)[..., 0]  # [N, 3]
-    viewmat = camera.viewmats[0]
-    rays = params["means"] + viewmat[:3, :3].T @ viewmat[:3, 3]  # [N, 3] from the camera's centre, −Rᵀ t
-    away = (rays * normals).sum(dim=1, keepdim=True) > 0
-    return F.normalize(blend(params, torch.where(away, -normals, normals), camera, drawing)[0], dim=-1)
+    log_children = num_children(counts).float().log()
+    return mean_map(params, log_children, camera, drawing).exp()
 
 
 def random_colors(number: int, generator: torch.Generator) -> Tensor:
@@ -93,10 +73,15 @@ def random_colors(number: int, generator: torch.Generator) -> Tensor:
 def recolor(colors: Tensor, origins: Tensor, generator: torch.Generator) -> Tensor:
     """Return colours [M, 3] after a densification step: children get new ones, other Gaussians keep theirs.
 
-    `origins`, int64 [M], are the indices before the step of each Gaussian, or of its parent.
+    Args:
+        colors: Colours before the step. [N, 3]
+        origins: Index before the step of each Gaussian, or of its parent. int64 [M]
+        generator: Draws the new colours.
     """
-    is_child = torch.bincount(origins, minlength=len(colors))[origins] > 1  # [M]
-    return torch.where(is_child[:, None], random_colors(len(origins), generator).to(colors), colors[origins])
+    family_sizes = torch.bincount(origins, minlength=len(colors))  # [N]
+    is_child = family_sizes[origins] > 1  # [M]
+    new_colors = random_colors(len(origins), generator).to(colors)
+    return torch.where(is_child[:, None], new_colors, colors[origins])
 
 
 def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Tensor:
@@ -104,8 +89,10 @@ def texture_period(structure_tensor: Tensor, frequency_constant: float = FREQUEN
 
     The structure tensor (xx, xy, yy) in 1/px² measures ω = c / σ, and a sine of period P responds most at σ = P / 2π.
     """
-    period = wavelength(structure_tensor)
-    return torch.where(period < 0.999 / WAVELENGTH_EPSILON, 2 * torch.pi * frequency_constant * period, torch.nan)
+    shortest = wavelength(structure_tensor)
+    has_texture = shortest < 0.999 / WAVELENGTH_EPSILON  # Without texture it is 1 / ε, up to rounding.
+    period = 2 * torch.pi * frequency_constant * shortest
+    return torch.where(has_texture, period, torch.nan)
 
 
 @dataclass(frozen=True)
@@ -124,50 +111,77 @@ def structure_ellipses(structure_tensor: Tensor, frequency_constant: float = FRE
     """Return S̄⁻¹ at the textured pixels of a regular grid. S̄ is (xx, xy, yy) in 1/px² [H, W, 3], and c in 1/px."""
     height, width = structure_tensor.shape[:2]
     spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0)
-    y, x = torch.meshgrid(
-        torch.arange(spacing / 2, height, spacing), torch.arange(spacing / 2, width, spacing), indexing="ij"
-    )
-    points = torch.stack([x.flatten(), y.flatten()], -1)  # [E, 2]
-    at = structure_tensor[points[:, 1].long(), points[:, 0].long()].double().cpu().nan_to_num(0.0)  # [E, 3]
-    xx, xy, yy = at.unbind(-1)
-    values, vectors = torch.linalg.eigh(torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2))  # ascending
+    rows = torch.arange(spacing / 2, height, spacing)
+    columns = torch.arange(spacing / 2, width, spacing)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten()], -1)  # [G, 2]
+    at_points = structure_tensor[points[:, 1].long(), points[:, 0].long()]  # [G, 3]
+    at_points = at_points.double().cpu().nan_to_num(0.0)
+    xx, xy, yy = at_points.unbind(-1)
+    matrices = torch.stack([xx, xy, xy, yy], -1).view(-1, 2, 2)
+    values, vectors = torch.linalg.eigh(matrices)  # ascending
+    frequencies = values.clamp_min(0).sqrt()  # [G, 2]
+    wavelengths = 1.0 / (frequencies + WAVELENGTH_EPSILON)  # descending
     longest = SCALE_STEP ** (NUM_LEVELS - 1) / frequency_constant
-    lengths = 1.0 / (values.clamp_min(0).sqrt() + WAVELENGTH_EPSILON)
-    textured = lengths[:, 1] < 2 * longest
-    short = vectors[textured, :, 1]  # The larger eigenvalue is the higher frequency.
+    is_textured = wavelengths[:, 1] < 2 * longest
+    short_axes = vectors[is_textured, :, 1]  # The larger eigenvalue is the higher frequency. [E, 2]
     return Ellipses(
-        centers=points[textured],
-        axes=lengths[textured].flip(-1).clamp_max(longest),
-        angles=torch.atan2(short[:, 1], short[:, 0]),
-        periods=texture_period(at[textured], frequency_constant),
+        centers=points[is_textured],
+        axes=wavelengths[is_textured].flip(-1).clamp_max(longest),
+        angles=torch.atan2(short_axes[:, 1], short_axes[:, 0]),
+        periods=texture_period(at_points[is_textured], frequency_constant),
         longest=longest,
         spacing=spacing,
     )
 
 
 def draw_ellipses(image: Picture, structure_tensor: Tensor, constant: float, size: tuple[int, int]) -> Picture:
-    """Draw S̄⁻¹ [H, W, 3] as ellipses over a dark grey copy of its image, of this height and width in px.
+    """Draw S̄⁻¹ as ellipses over a dark grey copy of its image.
 
-    A circle as wide as the grid's spacing has the coarsest wavelength on both axes. `constant` is c in 1/px.
+    A circle as wide as the grid's spacing has the coarsest wavelength on both axes.
+
+    Args:
+        image: The picture of which S̄ was computed. [H, W, 3]
+        structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
+        constant: The constant c in 1/px.
+        size: Height and width in px of the result.
     """
     ellipses = structure_ellipses(structure_tensor, constant)
     height, width = size
-    enlarge_x, enlarge_y = width / image.shape[1], height / image.shape[0]
-    picture = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if enlarge_x < 1 else cv2.INTER_LINEAR)
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    picture = np.repeat((0.5 * grey).astype(np.uint8)[..., None], 3, axis=-1)
+    enlarge_x = width / image.shape[1]
+    enlarge_y = height / image.shape[0]
+    picture = _dark_grey(image, size)
     if len(ellipses.centers) == 0:
         return picture
-    colors = PERIOD(ellipses.periods[None])[0]
-    # They are drawn relative to the grid's spacing, so that none vanish or overlap.
-    radius = 0.5 * ellipses.spacing * min(enlarge_x, enlarge_y) / ellipses.longest
-    fixed = 16  # OpenCV takes numbers with 4 bits after the point.
+    colors = PERIOD(ellipses.periods[None])[0]  # [E, 3]
+    # Axes are drawn relative to the grid's spacing, so that no ellipse vanishes and none overlap.
+    half_spacing = 0.5 * ellipses.spacing * min(enlarge_x, enlarge_y)
+    px_per_wavelength = half_spacing / ellipses.longest
     thickness = max(round(min(height, width) / 350), 1)
-    for center, axes, angle, color in zip(
+    for (x, y), axes, angle, color in zip(
         ellipses.centers.tolist(), ellipses.axes.tolist(), ellipses.angles.tolist(), colors.tolist(), strict=True
     ):
-        # OpenCV numbers pixels by their centres, we by their edges.
-        at = (round((center[0] * enlarge_x - 0.5) * fixed), round((center[1] * enlarge_y - 0.5) * fixed))
-        half = (max(round(axes[0] * radius * fixed), 1), max(round(axes[1] * radius * fixed), 1))
-        cv2.ellipse(picture, at, half, math.degrees(angle), 0, 360, color, thickness, cv2.LINE_AA, shift=4)
+        # OpenCV counts from the centre of the first pixel, and we from its edge.
+        center = (_in_subpixels(x * enlarge_x - 0.5), _in_subpixels(y * enlarge_y - 0.5))
+        half_short = max(_in_subpixels(axes[0] * px_per_wavelength), 1)
+        half_long = max(_in_subpixels(axes[1] * px_per_wavelength), 1)
+        degrees = math.degrees(angle)
+        cv2.ellipse(
+            picture, center, (half_short, half_long), degrees, 0, 360, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS
+        )
     return picture
+
+
+def _in_subpixels(length: float) -> int:
+    return round(length * SUBPIXELS)
+
+
+def _dark_grey(image: Picture, size: tuple[int, int]) -> Picture:
+    """Return a grey copy of a picture, half as bright, of this height and width in px."""
+    height, width = size
+    interpolation = cv2.INTER_LINEAR
+    if width < image.shape[1]:
+        interpolation = cv2.INTER_AREA
+    resized = cv2.resize(image, (width, height), interpolation=interpolation)
+    grey = 0.5 * cv2.cvtColor(resized, cv2.COLOR_RGB2GRAY)
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)

@@ -28,6 +28,7 @@ from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.forked_python import HANGS
 from helpers.gsplat_like import splatted
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
+from sadgs_ns.render.types import RenderOptions
 
 WIDTH, HEIGHT, VIEWS = 48, 36, 10
 ITERATIONS = 12
@@ -307,10 +308,11 @@ class FlatModel:
 @pytest.mark.parametrize(("near_plane", "planes"), [(0.01, []), (0.3, [0.01])])
 def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: float, planes: list[float]):
     model: Any = FlatModel()
-    model.config, model.device, model.near_plane, drawn = SimpleNamespace(), "cpu", near_plane, []
+    model.config, model.device, drawn = SimpleNamespace(), "cpu", []
+    plan = model.plan = RenderOptions(near_plane=near_plane)  # of a run's plan only the near plane is read
 
     def draw(camera: Any) -> dict[str, Tensor]:
-        drawn.append(model.near_plane)
+        drawn.append(model.plan.near_plane)
         return {"rgb": torch.full((12, 12, 3), camera), "background": torch.zeros(3)}
 
     model.get_outputs_for_camera = draw
@@ -319,7 +321,7 @@ def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: fl
     if planes:
         with pytest.raises(TypeError):  # of a camera that cannot be drawn
             evaluate.view_psnr_in_viewers(model, [(None, {})], [])
-    assert drawn == 2 * planes and model.near_plane == near_plane
+    assert drawn == 2 * planes and model.plan is plan
 
 
 # Protocol and command

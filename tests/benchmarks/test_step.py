@@ -10,7 +10,7 @@ import torch
 from benchmarks import __main__ as bench
 from benchmarks import step as steps
 from benchmarks.step import REPEATS, Step, milliseconds
-from sadgs_ns.method.memory import StepSize, kept_bytes, step_bytes
+from sadgs_ns.render.step_memory import StepSize, kept_bytes, step_bytes
 
 CPU = torch.device("cpu")
 

@@ -30,13 +30,13 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.method.growth import structure_aware
 from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.render import rasterization
+from sadgs_ns.render import blending, rasterization
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians
+from sadgs_ns.training.outputs import warn_once
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
-from sadgs_ns.viewer.elements import warn_once
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
 WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
@@ -345,7 +345,7 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         rendered.append(len(gaussians.means))
         return rasterization.rasterize(gaussians, *args)
 
-    monkeypatch.setattr(maps, "rasterize", rasterize)
+    monkeypatch.setattr(blending, "rasterize", rasterize)
     pipeline = pipeline_of(panel)
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(0.2)
@@ -406,19 +406,19 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    asked, statistics = pipeline.model.strategy, observe_training_views(pipeline.structure_cache)
+    asked, statistics = pipeline.model.plan.strategy, observe_training_views(pipeline.structure_cache)
     before, split = dataclasses.asdict(asked), []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau
         panel.set_tau_split.cb_hook(panel.set_tau_split)
-        strategy = pipeline.model.strategy
-        assert strategy.tau_split == tau
+        strategy = pipeline.model.plan.strategy
+        assert strategy.tau_split == tau and pipeline.model.strategy == strategy.for_run(pipeline.model.plan.iterations)
         counts = structure_aware(strategy, pipeline.model.gauss_params, statistics).children
         split.append(int((counts > 1).any(dim=1).sum()))
     assert split[0] == 0 < split[1] < split[2]
     panel.set_max_gaussians.value = 777
     panel.set_max_gaussians.cb_hook(panel.set_max_gaussians)
-    strategy = pipeline.model.strategy
+    strategy = pipeline.model.plan.strategy
     assert strategy.max_gaussians == 777 and type(strategy.max_gaussians) is int
     assert "cap 777" in panel.table.text()
     assert pipeline.config.model.strategy.max_gaussians != 777, "what was configured stays"

@@ -19,13 +19,14 @@ from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fractio
 from PIL import Image
 from rich.console import Console
 
+from helpers.captures import LAYOUTS, Capture, write_capture
 from helpers.drawn_photos import draw_photos
 from helpers.forked_python import HANGS
-from helpers.short_runs import nerfstudio_data
-from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.added_photos import choose_run
-from sadgs_ns.cli.sadgs import PhotosToSplat, Sadgs, main
+from sadgs_ns.cli.photos_to_splat import PhotosToSplat
+from sadgs_ns.cli.sadgs import main
+from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
 from sadgs_ns.files import locked
@@ -94,6 +95,27 @@ def times_of_results(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in found}
 
 
+def finish_again(command: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    """Run the command of a finished splat, which must not change a result; return the stages' lines."""
+    before = times_of_results(folder)
+    assert main(command) == 0
+    lines = lines_of(capsys.readouterr().out)
+    assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
+    assert times_of_results(folder) == before
+    return lines
+
+
+def run_unread(command: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process whose output nobody reads, as of `| head` that has read enough."""
+    read, written = os.pipe()
+    os.close(read)
+    code = f"from {sadgs.__name__} import main; raise SystemExit(main({command}))"
+    words = [sys.executable, "-W", "ignore", "-c", code]
+    unread = subprocess.run(words, stdout=written, stderr=subprocess.PIPE, text=True)
+    os.close(written)
+    return unread
+
+
 @pytest.mark.hard_case(
     "Ctrl-C on `sadgs` in its first, second and third stage",
     "the stage saves; the same command resumes, and does nothing twice",
@@ -149,17 +171,8 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert lines["in all"] == f"Open {(folder / 'splat.html').as_uri()}"
     assert len(read_points(folder / "splat.ply")[0]) > 0
 
-    before = times_of_results(folder)
-    assert main(command) == 0
-    lines = lines_of(capsys.readouterr().out)
-    assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
-    assert times_of_results(folder) == before
-    read, written = os.pipe()
-    os.close(read)  # as of `| head` that has read enough
-    code = f"from {sadgs.__name__} import main; raise SystemExit(main({command}))"
-    words = [sys.executable, "-W", "ignore", "-c", code]
-    unread = subprocess.run(words, stdout=written, stderr=subprocess.PIPE, text=True)
-    os.close(written)
+    lines = finish_again(command, folder, capsys)
+    unread = run_unread(command)
     assert (unread.returncode, lines_of(unread.stderr).keys()) == (0, lines.keys()), unread.stderr
     for changed, told in (
         (["--effort", "2"], "--effort was 1.0, is 2.0"),
@@ -216,11 +229,7 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     assert described["test_filenames"] == [f"images/{sorted(set(names) - set(later))[i]}" for i in held_out]
     assert len(described["train_filenames"]) == 10 - len(held_out)
 
-    before = times_of_results(folder)
-    assert main(command) == 0
-    lines = lines_of(capsys.readouterr().out)
-    assert all(lines[name].endswith("; done before") for name in ("cameras", "training", "export"))
-    assert times_of_results(folder) == before
+    finish_again(command, folder, capsys)
     (source / "03.png").unlink()
     assert main(command) == 2
     told = "(photos removed: 1, such as 03.png); put these photos back, give another folder or delete it."
@@ -500,77 +509,84 @@ def test_the_process_that_exports_starts_while_training_runs(
     assert [words[0] for words in commands] == ["ns-train", "sadgs-export", "sadgs-export"]
 
 
+@pytest.fixture(params=LAYOUTS)
+def capture(request: pytest.FixtureRequest, scene: Path, tmp_path: Path) -> Capture:
+    return write_capture(request.param, tmp_path / "capture", scene)
+
+
 @pytest.mark.hard_case(
     "`sadgs FOLDER` where the folder brings a COLMAP model, or one among its images, or `transforms.json`, or is one",
-    "its cameras are used and named; `--cameras new` finds others; nothing is written there; warnings of it, such as "
-    "that of masks that are not used, are printed; other images or masks there are another run, also of the same size",
+    "its cameras are used and named; nothing is written there; warnings of it, such as that of masks that are not "
+    "used, are printed",
 )
-@pytest.mark.parametrize("layout", ["sparse/0", "beside", "transforms.json", "file"])
 def test_cameras_that_a_folder_brings_are_used(
-    layout: str,
-    scene: Path,
-    tmp_path: Path,
-    commands: list[list[str]],
-    capsys: pytest.CaptureFixture[str],
+    capture: Capture, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
 ):
-    source = Path(shutil.copytree(scene, tmp_path / "capture"))
-    used = {"sparse/0": "sparse/0/images.bin", "beside": "images.bin"}.get(layout, "transforms.json")
-    if layout != "sparse/0":
-        (source / "sparse").rename(tmp_path / "sparse")
-    if layout == "beside":
-        shutil.copytree(tmp_path / "sparse/0", source, dirs_exist_ok=True)
-    elif layout != "sparse/0":
-        shutil.rmtree(source / "images")
-        nerfstudio_data(source)
-    mask = source / "masks" / "000.png"
-    mask.parent.mkdir()
-    Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
-    if (transforms := source / "transforms.json").exists():
-        described = json.loads(transforms.read_text())
-        described["frames"] = [frame | {"mask_path": r"masks\000.png"} for frame in described["frames"]]
-        transforms.write_text(json.dumps(described))
-    given = source / "transforms.json" if layout == "file" else source
-    before = {path: path.stat().st_mtime_ns for path in source.rglob("*")}
-    command = [str(given), "-o", str(tmp_path / "out"), "--formats", "ply"]
+    before = {path: path.stat().st_mtime_ns for path in capture.folder.rglob("*")}
+    command = capture.command(tmp_path / "out")
     assert main(command) == 0
-    cameras, printed = f"those of {source / used}; --cameras new finds others", capsys.readouterr().out
+    printed = capsys.readouterr().out
+    cameras = f"those of {capture.cameras}; --cameras new finds others"
     assert lines_of(printed)["cameras"] == cameras
     assert "\nmasks are not used: end the command with `-- colmap` to use them.\n" in printed
     assert [words[0] for words in commands] == ["ns-train", "sadgs-export"]
-    assert {words[words.index("--data") + 1] for words in commands} == {str(given)}
+    assert {words[words.index("--data") + 1] for words in commands} == {str(capture.given)}
     assert main(command) == 0
     lines = lines_of(capsys.readouterr().out)
     assert lines["cameras"] == cameras and lines["export"].endswith("done before") and len(commands) == 2
-    assert before == {path: path.stat().st_mtime_ns for path in source.rglob("*")}
+    assert before == {path: path.stat().st_mtime_ns for path in capture.folder.rglob("*")}
     assert main([*command, "--max-size", "800"]) == 2
-    assert (
-        f"--max-size is for new cameras, and those of {source / used} are used: leave it out, or for"
-        in capsys.readouterr().err
-    )
-    (source / "renders").mkdir()
-    rendering = Path(shutil.copy(image := min((source / "images").iterdir()), source / "renders"))
+    told = f"--max-size is for new cameras, and those of {capture.cameras} are used: leave it out, or for"
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.hard_case(
+    "`sadgs FOLDER` again, with other images or masks in the folder, which brings cameras",
+    "that is another run, also if they are of the same size",
+)
+def test_other_images_or_masks_beside_cameras_are_another_run(
+    capture: Capture, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    command = capture.command(tmp_path / "out")
+    assert main(command) == 0
+    image = min((capture.folder / "images").iterdir())
+    (capture.folder / "renders").mkdir()
+    rendering = Path(shutil.copy(image, capture.folder / "renders"))
     assert main(command) == 0, "a rendering of the run is no image of the capture"
     shutil.rmtree(rendering.parent)
-    for path in before:
+    for path in capture.folder.rglob("*"):
         os.utime(path, (0, 0))
     assert main(command) == 0 and len(commands) == 2, "a copy of the capture is no other capture"
-    for path in (mask, image):
+    for path in (capture.mask, image):
         whole = path.read_bytes()
         path.write_bytes(whole[:-1] + b" ")  # of the same size
         assert main(command) == 2
-        told = f"(images changed: 1, such as {path.relative_to(source)}); give another --output or delete it."
-        assert f"{tmp_path}/out was begun with other settings {told}" in capsys.readouterr().err
+        changes = f"(images changed: 1, such as {path.relative_to(capture.folder)})"
+        told = f"{tmp_path}/out was begun with other settings {changes}; give another --output or delete it."
+        assert told in capsys.readouterr().err
         path.write_bytes(whole)
-    (source / used).write_bytes((source / used).read_bytes() + b" ")
+
+
+@pytest.mark.hard_case(
+    "`sadgs FOLDER` where the cameras that the folder brings changed after a run, or are empty",
+    "refused; `--cameras new` finds others",
+)
+def test_other_or_empty_cameras_in_a_folder_are_refused(
+    capture: Capture, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    command = capture.command(tmp_path / "out")
+    assert main(command) == 0
+    capture.cameras.write_bytes(capture.cameras.read_bytes() + b" ")
     assert main(command) == 2
-    assert f"(--cameras was {source / used} (checksum " in capsys.readouterr().err
-    (source / used).write_bytes(b"")
-    assert main([*command[:2], str(tmp_path / "other"), *command[3:]]) == 2
+    assert f"(--cameras was {capture.cameras} (checksum " in capsys.readouterr().err
+    capture.cameras.write_bytes(b"")
+    other = tmp_path / "other"
+    assert main(capture.command(other)) == 2
     assert capsys.readouterr().err.endswith("; or find new cameras with --cameras new.\n")
-    assert not (tmp_path / "other").exists()
-    if layout != "file":
-        assert main([*command[:2], str(tmp_path / "other"), *command[3:], "--cameras", "new"]) == 0
-        assert commands[-3][:2] == ["sadgs-process", str(source)]
+    assert not other.exists()
+    if capture.given == capture.folder:
+        assert main([*capture.command(other), "--cameras", "new"]) == 0
+        assert commands[-3][:2] == ["sadgs-process", str(capture.folder)]
 
 
 @pytest.mark.hard_case(

@@ -29,7 +29,9 @@ from helpers.short_runs import blender_data, configure, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import check_data
-from sadgs_ns.data.parsers import AutomaticDataParserConfig, ColmapParser, check_capture, choose_parser
+from sadgs_ns.data.checks.capture import check_capture
+from sadgs_ns.data.own_parsers import ColmapParser
+from sadgs_ns.data.parsers import AutomaticDataParserConfig, choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 
@@ -296,7 +298,7 @@ def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_trai
 @pytest.fixture
 def large(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A capture whose images are larger than nerfstudio takes without a question."""
-    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.images.MAX_AUTO_RESOLUTION", 20)
     return Path(shutil.copytree(scene, tmp_path / "large"))
 
 
@@ -326,7 +328,7 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
 )
 @pytest.mark.parametrize("rounding", ["floor", "round", "ceil"])
 def test_smaller_copies_are_read_as_they_were_rounded(rounding: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.images.MAX_AUTO_RESOLUTION", 20)
     write_scene(tmp_path / "scene", 49, 38, 10, 60)  # A fourth is 12.25 and 9.5 px.
     size = {"floor": (12, 9), "round": (12, 10), "ceil": (13, 10)}[rounding]
     for folder, copy_size in (("images_2", (24, 19)), ("images_4", size)):
@@ -396,7 +398,7 @@ def test_smaller_copies_without_the_images_are_read_by_the_option_that_is_told(
     "refused: make them, or `--downscale-factor 1`, with which it trains",
 )
 def test_masks_without_smaller_copies_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sadgs_ns.data.checks.images.MAX_AUTO_RESOLUTION", 20)
+    monkeypatch.setattr("sadgs_ns.data.images.MAX_AUTO_RESOLUTION", 20)
     nerfstudio_data(tmp_path, masks=True)
     for factor in (2, 4):
         (tmp_path / f"images_{factor}").mkdir()

@@ -33,21 +33,15 @@ from torch import Tensor
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.drawn_photos import color_profile
 from helpers.forked_python import HANGS
-from helpers.short_runs import (
-    blender_data,
-    configure,
-    is_finite,
-    nerfstudio_data,
-    set_up,
-    train,
-)
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import blender_data, configure, is_finite, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import doctor
-from sadgs_ns.data import colmap, parsers
-from sadgs_ns.data.checks import check_data
+from sadgs_ns.data import colmap
+from sadgs_ns.data.checks import capture, check_data
 from sadgs_ns.data.checks.findings import Finding, check_findings
-from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError, RunError
 
 CHECKOUT = Path(__file__).parents[2]
@@ -987,13 +981,13 @@ def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
     captures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     checked: list[Path] = []
-    check_colmap = parsers.CHECKS[ColmapDataParserConfig]
+    check_colmap = capture.CHECKS[ColmapDataParserConfig]
 
     def check(data: Path, *options: Any) -> list[Finding]:
         checked.append(data)
         return check_colmap(data, *options)
 
-    monkeypatch.setitem(parsers.CHECKS, ColmapDataParserConfig, check)
+    monkeypatch.setitem(capture.CHECKS, ColmapDataParserConfig, check)
     first = Path(shutil.copytree(captures / "colmap", tmp_path / "first"))
     second = Path(shutil.copytree(captures / "colmap", tmp_path / "second"))
     config = configure(tmp_path / "out", parser_of(first))

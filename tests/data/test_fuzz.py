@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
-from sadgs_ns.data.parsers import check_capture
+from sadgs_ns.data.checks.capture import check_capture
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 

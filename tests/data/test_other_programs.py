@@ -22,8 +22,8 @@ from helpers.short_runs import blender_data, nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.layouts import poses_elsewhere
-from sadgs_ns.data.parsers import TransformsParser
 from sadgs_ns.data.run_cameras import read_cameras
+from sadgs_ns.data.transforms_parser import TransformsParser
 
 # nerfstudio opens an image, to look for smaller copies of it, and leaves it open.
 pytestmark = pytest.mark.filterwarnings(

@@ -16,7 +16,7 @@ from PIL import Image
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.colmap import check_colmap
-from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.layouts import ParserOptions
 
 K1 = -0.2  # Of a lens that bends more than those of phones
 

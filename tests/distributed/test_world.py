@@ -92,8 +92,7 @@ def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Pa
 
 def prune_together(world: World) -> list[int]:
     """Numbers of Gaussians of this process after each of two prunings, and after the shards were evened out."""
-    strategy = StructureAwareStrategy()
-    strategy.world = world
+    strategy = StructureAwareStrategy().for_run(3000, world)
     means = torch.arange(12.0).view(4, 3) + 12 * world.rank
     params = {"means": torch.nn.Parameter(means), "opacities": torch.nn.Parameter(torch.ones(4))}
     optimizers = {name: torch.optim.Adam([parameter]) for name, parameter in params.items()}

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.geometry.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
 
 NEAR = 2.0
 """The near plane: space is empty up to 3 from the paths."""
@@ -178,6 +179,6 @@ def test_densification_steps_prune_haze_and_the_last_one_keeps_the_paths_for_a_r
     for step in state.get("structure_steps", []):
         assert (step["before"], step["pruned"], step["after"]) == (3, 1, 2)
     params["means"].data[0] = means[0]  # Haze that arises later
-    strategy.prune_haze(params, optimizers, state)
+    strategy.for_run(3000).prune_haze(params, optimizers, state)
     assert params["means"].tolist() == means[2:].tolist()
     assert {len(p) for p in params.values()} == {1}

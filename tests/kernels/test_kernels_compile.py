@@ -109,7 +109,7 @@ for i, parameter in enumerate(_update.params):
     elif name in ("rates", "scales"):
         signature[name] = ("*fp32",) * 3
     else:
-        others = {"noted": "*fp32", "overflowed": ("*i64",), "rows": "i32"}
+        others = {"nonfinite_flag": "*fp32", "overflowed": ("*i64",), "rows": "i32"}
         others |= {"beta1": "fp32", "beta2": "fp32", "eps": "fp32"}
         signature[name] = others.get(name, "constexpr")
 constants = {"WIDTHS": (3, 45, 1), "FLAGS": 1, "MAX": 1e18, "BLOCK": 1024}

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -24,22 +25,24 @@ from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from helpers.short_runs import configure, is_finite, set_up
+from helpers.kill_and_resume import set_up
+from helpers.short_runs import configure, is_finite
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns import kernels
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import RunError
 from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales
-from sadgs_ns.method import memory
-from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import absgs
-from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.split import children_per_axis
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
+from sadgs_ns.render import step_memory
+from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.model import SadgsModel
@@ -109,7 +112,7 @@ def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = {name: p.detach().clone() for name, p in params.items()}
-    short(max_gaussians=50 + 3 * 511 + 100).densify(params, adam(params, lr=0.0), state, 9, [])
+    short(max_gaussians=50 + 3 * 511 + 100).for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
     assert all(p.isfinite().all() for p in params.values())
     torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8 / 1.5))
@@ -121,7 +124,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
 def test_where_none_violates_nothing_is_split(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = params["means"].detach().clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], before)
 
 
@@ -214,7 +217,7 @@ def test_children_smaller_than_the_papers_or_as_large_as_a_parent_are_refused(ch
 @pytest.mark.hard_case("a run without CUDA", "no limit of memory is assumed")
 def test_without_cuda_memory_is_not_planned():
     params = random_params(5)
-    assert memory.affordable_growth(params, {}, memory.free_bytes(CPU), StepSize()) == math.inf
+    assert step_memory.affordable_growth(params, {}, step_memory.free_bytes(CPU), StepSize()) == math.inf
 
 
 @pytest.mark.hard_case("what a new Gaussian keeps in memory", "is counted")
@@ -233,19 +236,19 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
         return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
     before = bytes_kept()
-    short().densify(params, optimizers, state, 9, [])
+    short().for_run(3000).densify(params, optimizers, state, 9, [])
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
-    at_first, later = (max(memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
-    pairs = memory.PAIRS_PER_GAUSSIAN * grown * memory.PAIR_SORT_BYTES
+    at_first, later = (max(step_memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
+    pairs = step_memory.PAIRS_PER_GAUSSIAN * grown * step_memory.PAIR_SORT_BYTES
     widest = 16  # quaternions
-    lists = memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
+    lists = step_memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
     needed = bytes_kept() - before + (50 + grown) * widest + max(lists, later)
     original = random_params(50)
-    assert memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
-    assert memory.affordable_growth(original, observed(50, 4.0), needed - 1, size) == grown - 1
-    assert memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
+    assert step_memory.affordable_growth(original, observed(50, 4.0), needed, size) == grown
+    assert step_memory.affordable_growth(original, observed(50, 4.0), needed - 1, size) == grown - 1
+    assert step_memory.affordable_growth(original, observed(50, 4.0), at_first, size) == 0
 
 
 @pytest.mark.hard_case(
@@ -308,7 +311,7 @@ def test_pruning_may_leave_one():
     params, state = random_params(5), observed(5, 0.01)
     params["opacities"].data = torch.logit(torch.tensor([0.01, 0.02, 0.9, 0.03, 0.04]))
     kept = params["means"].detach()[2:3].clone()
-    short().densify(params, adam(params, lr=0.0), state, 9, [])
+    short().for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert torch.equal(params["means"], kept)
 
 
@@ -378,6 +381,7 @@ def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     model: SadgsModel = config.setup(
         scene_box=SceneBox(torch.ones(2, 3)), num_train_data=1, seed_points=(points, colors)
     )
+    model.plan = SimpleNamespace(near_plane=NEAR_PLANE, max_off_axis=config.max_off_axis)  # type: ignore[assignment]
     params = model.gauss_params
     assert len(params["means"]) >= len(points)
     assert all(bool(p.isfinite().all()) for p in params.values())
@@ -497,7 +501,7 @@ def test_the_guard_never_waits_within_a_step():
     with HostWaits() as waits:
         for step in range(10):
             assert not log.full
-            nonfinite.leave_out_nonfinite(gradient, log.slot)
+            nonfinite.leave_out_nonfinite(gradient, log.nonfinite_flag)
             log.record(step, [step], loss)
     assert waits.number == 0 and log.full and not gradient.any()
     with HostWaits() as waits:
@@ -518,7 +522,7 @@ def test_the_log_names_steps_and_forgets_them_once_read():
     log = nonfinite.NonFiniteLog(CPU, capacity=4)
     log.record(7, [3], torch.tensor(0.5))
     log.record(8, [1, 2], torch.tensor(math.inf))
-    log.slot.fill_(math.nan)
+    log.nonfinite_flag.fill_(math.nan)
     log.record(9, [0], torch.tensor(0.5))
     assert log.read() == [(8, [1, 2], "the loss was inf"), (9, [0], "gradients were not finite")]
     log.record(10, [0], torch.tensor(0.5))

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 import torch.nn.functional as F
+from gsplat.strategy.base import Strategy
 
 from helpers.small_scenes import adam, camera, random_params, training_step
-from sadgs_ns.method import strategy as strategy_module
+from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
@@ -33,8 +34,20 @@ def checker_images(views: int) -> torch.Tensor:
     return (0.25 + 0.5 * checker)[None, ..., None].repeat(views, 1, 1, 3)
 
 
-def train(strategy: StructureAwareStrategy, steps: int, *, per_axis_radii: bool = False, views: int = 1, n: int = 60):
-    """A training loop as gsplat's own, without nerfstudio; the hard cap is checked after every step."""
+def train(
+    options: StructureAwareStrategy,
+    steps: int,
+    *,
+    strategy: Any = None,
+    per_axis_radii: bool = False,
+    views: int = 1,
+    n: int = 60,
+):
+    """A training loop as gsplat's own, without nerfstudio; the hard cap is checked after every step.
+
+    It trains with the options themselves, or with a strategy that was made of them.
+    """
+    strategy = options if strategy is None else strategy
     torch.manual_seed(0)
     params = random_params(n)
     params["scales"].data += 1.0  # up to 10 px, against squares of 4 px
@@ -51,7 +64,7 @@ def train(strategy: StructureAwareStrategy, steps: int, *, per_axis_radii: bool 
             strategy, params, optimizers, state, step, images, tensors, viewmats, Ks, per_axis_radii=per_axis_radii
         )
         counts.append(len(params["means"]))
-        assert counts[-1] <= strategy.max_gaussians
+        assert counts[-1] <= options.max_gaussians
         assert all(len(value) == counts[-1] for value in state.values() if isinstance(value, torch.Tensor))
         assert all(p.isfinite().all() for p in params.values())
     return params, state, counts
@@ -72,6 +85,17 @@ def test_drops_into_a_plain_gsplat_loop(per_axis_radii: bool, views: int):
     _, state, counts = train(short(max_gaussians=3000), 22, per_axis_radii=per_axis_radii, views=views)
     assert counts[-1] > 120, "a fine checker under coarse Gaussians must be split"
     assert {"n_high", "n_low", "eta_max", "n_total", "grad2d", "absgrad2d", "grad_count"} <= set(state)
+
+
+def test_options_densify_as_the_strategy_that_is_made_of_them():
+    options = short(max_gaussians=3000)
+    strategy = options.for_run(3000)
+    assert isinstance(options, Strategy) and isinstance(strategy, Strategy)
+    params, state, counts = train(options, 26)
+    same_params, same_state, same_counts = train(options, 26, strategy=strategy)
+    assert counts == same_counts and state == same_state
+    for name, parameter in params.items():
+        assert torch.equal(parameter, same_params[name])
 
 
 def test_structure_step_splits_in_one_step_and_forgets_the_parents():
@@ -125,7 +149,8 @@ def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch
 
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 3, longest))
     strategy = short(max_gaussians=200, structure_every=0, clone_grad2d=1e9, split_absgrad2d=1e9)
-    assert strategy.densifies(2) and strategy.densifies(3) and not strategy.densifies(4)
+    running = strategy.for_run(3000)
+    assert running.densifies(2) and running.densifies(3) and not running.densifies(4)
     _, state, counts = train(strategy, 11)
     assert counts == [60, 60, 120, 120, 120, *[200] * 6]
     assert state["grad_count"].any() and strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
@@ -157,9 +182,10 @@ def test_windows_follow_the_length_of_the_run_but_for_those_that_are_given():
     assert strategy.for_run(6000).windows == Windows(
         structure_every=1000, absgs_every=200, refine_start_iter=200, refine_stop_iter=3200, reset_every=0, eta_every=7
     )
-    fitted = strategy.for_run(3000)
+    fitted = strategy.fitted(3000)
     assert fitted.windows.structure_every == fitted.structure_every == strategy.windows.structure_every == 500
-    assert strategy.structure_every is None and fitted.for_run(3000) == fitted
+    assert strategy.structure_every is None and fitted.fitted(3000) == fitted
+    assert strategy.for_run(3000) == fitted.for_run(3000) and strategy.for_run(3000).windows == fitted.windows
 
 
 def test_a_run_too_short_to_densify_prepares_nothing_for_it():
@@ -170,7 +196,7 @@ def test_a_run_too_short_to_densify_prepares_nothing_for_it():
 
 
 def test_eta_is_observed_only_where_a_structure_step_will_read_it():
-    strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10)
+    strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10).for_run(3000)
     assert strategy.observes(0) and strategy.observes(1490)
     assert not strategy.observes(5) and not strategy.observes(1500) and not strategy.observes(2500)
 
@@ -186,14 +212,13 @@ def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
     assert not any(strategy.needs_absgrad(step) for step in range(3000))
 
 
-def test_keeping_all_gradients_changes_nothing():
-    class Hoarder(StructureAwareStrategy):
-        def needs_absgrad(self, step: int) -> bool:
-            return step < self.windows.refine_stop_iter
-
+def test_keeping_all_gradients_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     thrifty = short(clone_grad2d=2e-5, split_absgrad2d=4e-5)
     plain, _, counts = train(thrifty, 26)
-    hoarded, _, same = train(Hoarder(**vars(thrifty)), 26)
+    hoarder = thrifty.for_run(3000)
+    assert not all(hoarder.needs_absgrad(step) for step in range(24))
+    monkeypatch.setattr(hoarder, "needs_absgrad", lambda step: step < hoarder.windows.refine_stop_iter)
+    hoarded, _, same = train(thrifty, 26, strategy=hoarder)
     assert counts == same and counts[3] > 60 and counts[9] > counts[8]
     for name, parameter in plain.items():
         assert torch.equal(parameter, hoarded[name])
@@ -264,13 +289,13 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
     state["n_low"][3] = torch.tensor([10.0, 10.0, 0.0])  # 3: faint, but one axis is not low
     optimizers = adam(params, lr=0.0)
     keep = params["means"].detach()[1:].clone()
-    short().densify(params, optimizers, state, 9, [])
+    short().for_run(3000).densify(params, optimizers, state, 9, [])
     torch.testing.assert_close(params["means"].detach(), keep)
 
 
 def test_pruning_never_leaves_nothing():
     params = random_params(5)
-    n = short()._prune(params, adam(params), {}, 1.0)
+    n = short().for_run(3000)._prune(params, adam(params), {}, 1.0)
     assert n == 0 and len(params["means"]) == 5
 
 
@@ -283,7 +308,7 @@ def grow_with(params, state, budget: int = 1000, long_axis: bool = False) -> tup
     options = {"clone_grad2d": 2e-4, "split_absgrad2d": 4e-4, "absgs_long_axis": long_axis}
     strategy = StructureAwareStrategy(max_gaussians=len(params["means"]) + budget, **options)
     state["scene_scale"] = 100.0
-    proposal, allowed = strategy.planned_growth(absgs, params, state)
+    proposal, allowed = strategy.for_run(3000).planned_growth(absgs, params, state)
     apply(proposal, allowed, params, adam(params, lr=0.0), state)
     assert proposal.clone is not None
     return int((allowed & proposal.clone).sum()), int((allowed & ~proposal.clone).sum())
@@ -377,13 +402,17 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
     params = random_params(3)
     strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, split_min_opacity=0.0)
-    assert strategy.planned_children(params, statistics).tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+
+    def planned() -> torch.Tensor:
+        return strategy.for_run(3000).planned_children(params, statistics)
+
+    assert planned().tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 5  # room for two more: the larger η comes first
-    assert strategy.planned_children(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert planned().tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
     strategy.max_gaussians = 2
-    assert (strategy.planned_children(params, statistics) == 1).all()
+    assert (planned() == 1).all()
     strategy.max_gaussians, strategy.min_observations = 6, 2
-    assert (strategy.planned_children(params, statistics) == 1).all(), "one observation is no consistency"
+    assert (planned() == 1).all(), "one observation is no consistency"
     strategy.min_observations, strategy.split_min_opacity = 1, 0.5
     params["opacities"].data = torch.logit(torch.tensor([0.4, 0.6, 0.6]))
-    assert strategy.planned_children(params, statistics).tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert planned().tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]

@@ -41,10 +41,11 @@ from rich.progress import Progress
 from helpers.drawn_photos import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
 from sadgs_ns.cli import process as program
 from sadgs_ns.cli.process import Process, main, process
-from sadgs_ns.data.checks.layouts import ParserOptions
 from sadgs_ns.data.checks.transforms import check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing import features, place, reconstruct
+from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_masks
 from sadgs_ns.placing.folder import find_source, look_into
@@ -165,8 +166,7 @@ def test_photos_are_registered_where_they_were_taken(run: Run):
 def test_all_points_and_cameras_are_adjusted_at_the_end(run: Run):
     model = pycolmap.Reconstruction(run.out / "work" / "model")
     error = model.compute_mean_reprojection_error()
-    pycolmap.bundle_adjustment(model)
-    model.update_point_3d_errors()
+    adjust_robustly(model)
     assert error == pytest.approx(model.compute_mean_reprojection_error(), rel=3e-4)
 
 
@@ -217,14 +217,14 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: int, stretch: float
 ):
     shutil.copy(run.out / "work" / "database.db", tmp_path)
-    mapping, adjustment, angles = pycolmap.incremental_mapping, pycolmap.bundle_adjustment, []
+    mapping, angles = pycolmap.incremental_mapping, []
 
     def note_the_angle(*arguments: Any, **callbacks: Any) -> Any:
         angles.append(arguments[3].mapper.init_min_tri_angle)
         return mapping(*arguments, **callbacks)
 
-    def spoil_the_first(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-        adjustment(model, options)
+    def spoil_the_first(model: pycolmap.Reconstruction, *fixed: Any) -> None:
+        adjust_robustly(model, *fixed)
         if len(angles) == 1:
             for frame in list(model.frames)[registered:]:
                 model.deregister_frame(frame)
@@ -232,7 +232,7 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
                 camera.focal_length_x *= stretch
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", note_the_angle)
-    monkeypatch.setattr(pycolmap, "bundle_adjustment", spoil_the_first)
+    monkeypatch.setattr(reconstruct, "adjust_robustly", spoil_the_first)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
@@ -1431,7 +1431,8 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     assert process(Process(source, out, max_size=120)).registered == 8
     described = json.loads((out / "transforms.json").read_text())
     widths = {frame["file_path"]: frame["w"] for frame in described["frames"]}
-    assert "w" not in described and widths.pop("images/09.png") == 120 and set(widths.values()) == {before["w"]}
+    # Without distortion, an image can be a column narrower than its photo.
+    assert "w" not in described and widths.pop("images/09.png") in (119, 120) and set(widths.values()) == {before["w"]}
 
 
 @pytest.mark.hard_case(

@@ -17,7 +17,7 @@ from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers import forked_python
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns.cli import sadgs
-from sadgs_ns.cli.sadgs import PhotosToSplat
+from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.method import growth, statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor

@@ -37,7 +37,7 @@ from sadgs_ns.training.config import (
     SadgsViewerConfig,
 )
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.run import stereo_start
+from sadgs_ns.training.run import planning, stereo_start
 from sadgs_ns.training.step.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
 
 if sys.version_info >= (3, 11):
@@ -46,7 +46,7 @@ else:
     import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[2]
-NO_OPTIONS = {"_fitted", "world"}
+NO_OPTIONS = {"windows", "world"}
 """Attributes of the strategy that are decided in each run."""
 METHODS = ("sadgs", "sadgs-paper", "sadgs-paper-indoor")
 CONFIG_CLASSES = (
@@ -168,11 +168,12 @@ def test_presets_share_nothing_that_one_of_them_could_change():
 
 
 def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
-    ours = "".join(inspect.getsource(module) for module in (model_module, initial_gaussians, stereo_start))
+    ours = "".join(inspect.getsource(module) for module in (model_module, initial_gaussians, stereo_start, planning))
     overridden = set(vars(SadgsModel)) - set(re.findall(r"super\(\)\.(\w+)", ours))
     methods = [m for name, m in vars(SplatfactoModel).items() if inspect.isfunction(m) and name not in overridden]
     used = [m for m in methods if m.__name__ not in ("_get_downscale_factor", "_downscale_if_required")]
-    read = set(re.findall(r"config\.(\w+)", ours + "".join(inspect.getsource(method) for method in used)))
+    sources = ours + "".join(inspect.getsource(method) for method in used)
+    read = set(re.findall(r"(?:config|options\.model)\.(\w+)", sources))
     options = {option.name for option in dataclasses.fields(SadgsModelConfig) if not option.name.startswith("_")}
     assert {name for name in read if name in vars(SplatfactoModelConfig())} <= options
     assert options <= read, "an option that nothing reads"
@@ -317,7 +318,7 @@ def test_everything_imported_is_required_by_us_or_by_nerfstudio():
     # Python 3.10 has no tomllib, for which tomli stands there.
     extras = project["optional-dependencies"]
     for_tests = ours | requirements(extras["dev"] + extras["docs"])
-    local = {*folders, "tomllib", *(path.stem for path in (CHECKOUT / "tests").glob("*.py"))}
+    local = {*folders, "helpers", "tomllib", *(path.stem for path in (CHECKOUT / "tests").rglob("*.py"))}
     distributions = packages_distributions()
     undeclared = []
     for path in [path for folder in folders for path in CHECKOUT.glob(f"{folder}/**/*.py")]:

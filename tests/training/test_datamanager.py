@@ -25,9 +25,9 @@ from plyfile import PlyData, PlyElement
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers.short_runs import blender_data, nerfstudio_data
 from sadgs_ns.data import ply
+from sadgs_ns.data.checks.capture import check_capture
 from sadgs_ns.data.checks.geometry import check_ply
 from sadgs_ns.data.coordinates import Similarity
-from sadgs_ns.data.parsers import check_capture
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager

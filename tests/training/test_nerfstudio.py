@@ -503,7 +503,7 @@ def test_what_a_killed_save_leaves_does_not_hinder_resuming(colmap: ColmapDataPa
     code = f"""
 import os, signal, torch
 from pathlib import Path
-from sadgs_ns.training import checkpoints
+from sadgs_ns.training.run import checkpoints
 def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
@@ -558,7 +558,9 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, camera_optim
         pipeline.follow(dataclasses.replace(pipeline.model.plan, views_per_iteration=len(indices)))
         pipeline.views.sampler.requeue(indices)
         update = AdamUpdate({"means": FusedAdam([model.means], lr=0.0)})
-        return training_step(model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.slot).loss
+        return training_step(
+            model, pipeline.next_views(0), 0.0, update, update.factors(), pipeline.log.nonfinite_flag
+        ).loss
 
     alone = [loss(index) for index in range(5)]
     assert len({round(float(value), 4) for value in alone}) == 5
@@ -671,7 +673,7 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
     _, pipeline, _, _ = eval_setup(finished / "config.yml")
     model: Any = pipeline.model
     assert isinstance(model, SadgsModel) and model.config.near_plane is None
-    assert model.near_plane == stored
+    assert model.plan.near_plane == stored
     datamanager: Any = pipeline.datamanager
     cameras = datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
@@ -694,9 +696,9 @@ def test_a_plane_that_is_given_is_kept_also_where_the_checkpoint_has_another(
 ):
     config = configure(tmp_path, colmap, ITERATIONS)
     config.pipeline.model.near_plane = 0.123
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.load_dir = finished / "nerfstudio_models"
-    assert set_up(config).pipeline.model.near_plane == 0.123
+    assert set_up(config).pipeline.model.plan.near_plane == 0.123
     config.pipeline.model.near_plane = 0.0
     with pytest.raises(InputError, match=r"^pipeline\.model\.near_plane must be positive and finite, got 0\.$"):
         set_up(config)

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
-from sadgs_ns.geometry.cleaning import Cleaning, find_remaining, measure_visibility
+from sadgs_ns.geometry.cleaning import Cleaning, choose_remaining, measure_visibility
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.viewer.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options
+from sadgs_ns.viewer.cleaning_text import removal_sentences
 
 
 @pytest.fixture
@@ -90,7 +93,8 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     assert [len(cameras) for cameras in looks] == [views]
     params = dict(model.gauss_params.items())
     seen = measure_visibility(params, looks[0], model.drawing)
-    _, sentences = find_remaining(params, Cleaning(min_views=3), seen)
+    cleaning = Cleaning(min_views=3)
+    sentences = removal_sentences(cleaning, choose_remaining(params, cleaning, seen))
     assert said.startswith(sentences[0])
     model.step += 1
     set_to(panel, dust=0.6)
@@ -105,6 +109,16 @@ def test_a_reversed_box_is_told_and_changes_nothing(pipeline: SadgsPipeline, cap
     assert said.startswith("The picture stays as it was: --crop -100 -100 -100 -200 100 100 is no box: give ")
     assert "is no box" in " ".join(capsys.readouterr().out.split())
     assert torch.equal(shown(pipeline)[1], before)
+
+
+@torch.no_grad()
+def test_a_camera_that_is_no_pinhole_leaves_the_preview_empty_and_the_viewer_drawing(pipeline: SadgsPipeline):
+    set_to(pipeline.cleaning, choice=STAYS)
+    camera = copy.deepcopy(pipeline.datamanager.train_dataset.cameras[:1])
+    camera.camera_type = torch.full_like(camera.camera_type, CameraType.EQUIRECTANGULAR.value)
+    outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
+    assert torch.equal(outputs[OUTPUT], outputs["rgb"])
+    assert not outputs["accumulation"].any()
 
 
 def test_evaluation_gets_no_picture_of_the_panel(pipeline: SadgsPipeline):

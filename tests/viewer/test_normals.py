@@ -18,14 +18,15 @@ from PIL import Image
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
 from helpers.small_scenes import HEIGHT, WIDTH, camera
+from sadgs_ns.render.normals import normals_map
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import NORMALS, SadgsModel
+from sadgs_ns.training.outputs import LazyOutputs
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.run_folder import write_config
 from sadgs_ns.training.run.trainer import SadgsTrainer
-from sadgs_ns.viewer.elements import LazyOutputs, shows_output
-from sadgs_ns.viewer.maps import normals_map
+from sadgs_ns.viewer.elements import shows_output
 
 
 def discs(angles: list[float], spacing: float = 1.5) -> dict[str, torch.Tensor]:

@@ -110,7 +110,7 @@ def test_what_goes_wrong_is_told_in_the_panel_too(
     def full(*_: Any) -> None:
         raise RuntimeError("CUDA out of memory.\nOf no interest.")
 
-    monkeypatch.setattr(panel_module, "observe_training_views", full)
+    monkeypatch.setattr(pipeline.model, "render", full)
     panel = pipeline.structure
     panel.observe.cb_hook(panel.observe)
     assert told(panel)[-1] == "The viewer's panel stays as it was: CUDA out of memory"

@@ -16,6 +16,7 @@ from PIL import Image
 
 from helpers.small_scenes import camera, random_params
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
+from sadgs_ns.render.blending import blend
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel
@@ -196,7 +197,7 @@ def test_figures_are_written_whole_with_all_panels(tmp_path: Path):
 def test_blending_agrees_with_the_splatter_s_colors():
     params = {name: value.detach() for name, value in random_params(50).items()}
     colors = torch.rand((50, 3), generator=torch.Generator().manual_seed(1))
-    render, cover = maps.blend(params, colors, view())
-    ones, _ = maps.blend(params, torch.ones(50, 3), view())
+    render, cover = blend(params, colors, view())
+    ones, _ = blend(params, torch.ones(50, 3), view())
     torch.testing.assert_close(ones, cover.expand(-1, -1, 3))
     assert render.shape == (48, 64, 3) and (render <= ones + 1e-6).all()

@@ -82,7 +82,7 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
             page.run(f"{ELEMENT.format('max_gaussians')}.select()")
             page.type("4567")
             page.press("Enter", 13)
-            eventually(lambda: pipeline.model.strategy.max_gaussians == 4567)
+            eventually(lambda: pipeline.model.plan.strategy.max_gaussians == 4567)
             page.wait_for("document.body.innerText.includes('cap 4,567')")
             select(page, "Preview", "what stays")
             number = pipeline.model.num_points

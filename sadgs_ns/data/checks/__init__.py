@@ -1,14 +1,17 @@
-"""Checks of a data folder before nerfstudio parses it, in under a second for a few hundred images, without torch."""
+"""Checks of a data folder before nerfstudio parses it, in under a second for a few hundred images.
+
+They need no torch; only `capture`, the check with the settings of a run, imports nerfstudio.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
 
-from sadgs_ns.data.checks.colmap import automatic_options, check_colmap
+from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
-from sadgs_ns.data.checks.layouts import ParserOptions, layout_of
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
+from sadgs_ns.data.layouts import ParserOptions, automatic_options, layout_of
 
 
 @collect_findings

@@ -13,13 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sadgs_ns.data import colmap
-from sadgs_ns.data.checks import images, layouts
+from sadgs_ns.data import colmap, images, layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
-from sadgs_ns.data.checks.geometry import Camera, View, check_points, check_positive, check_views
-from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.checks.geometry import check_points, check_views
+from sadgs_ns.data.checks.images import check_images
+from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
+from sadgs_ns.data.layouts import ParserOptions, automatic_options
 from sadgs_ns.data.text import read_text
+from sadgs_ns.data.views import Camera, View, check_positive
 from sadgs_ns.errors import InputError
 
 UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's camera models that nerfstudio cannot read
@@ -28,14 +30,16 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's c
 @collect_findings
 def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -> Iterator[Finding]:
     """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
-    folder, model_folder = data / options.images_path, data / options.colmap_path
+    folder = data / options.images_path
+    model_folder = data / options.colmap_path
     if (kind := colmap.model_kind(model_folder)) is None:
         if not (models := layouts.find_reconstructions(data)):
-            raise InputError(layouts.no_layout(data))
+            raise InputError(no_layout(data))
         found = automatic_options(data)
         problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
         raise InputError(f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`.")
-    cameras_path, poses_path = model_folder / f"cameras.{kind}", model_folder / f"images.{kind}"
+    cameras_path = model_folder / f"cameras.{kind}"
+    poses_path = model_folder / f"images.{kind}"
     names, views = _read_views(poses_path, cameras_path)
     this_model = f"end the command with `colmap {_words(data, options, names)}"
     yield from _check_folders(data, options, names, poses_path)
@@ -48,12 +52,13 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
     if open_images:
         factor = yield from _check_factor(folder, names, options)
-        masks, frames = None if options.masks_path is None else data / options.masks_path, []
+        masks = None if options.masks_path is None else data / options.masks_path
+        frames = []
         for name, camera in zip(names, (view.camera for view in views), strict=True):
             size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
             mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
             frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
-        yield from images.check_images(frames, poses_path, look_for_unused=factor == 1)
+        yield from check_images(frames, poses_path, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
@@ -98,7 +103,8 @@ def _words(data: Path, options: ParserOptions, names: Sequence[str]) -> str:
 
 def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[View]]:
     """Return the images' names and views; raise InputError if there is none, or one makes no sense to nerfstudio."""
-    stored, poses = colmap.read_cameras(cameras_path), colmap.read_poses(poses_path)
+    stored = colmap.read_cameras(cameras_path)
+    poses = colmap.read_poses(poses_path)
     if not poses:
         raise InputError(f"{poses_path} holds no pose, so there is no image to train on: run COLMAP's mapper again.")
     for name, camera_id, pose in poses:
@@ -141,26 +147,11 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
     return 1
 
 
-def automatic_options(data: Path) -> ParserOptions:
-    """Return how a folder's reconstruction, which it must have, is read where no parser is named.
-
-    Without the smaller copies that it wants, nerfstudio's parser of COLMAP's files asks a question at the terminal. So
-    that it never has to, the images are then taken at full resolution, as they are beside a `transforms.json`.
-    """
-    model, names = next(iter(layouts.find_reconstructions(data).items()))
-    folder = layouts.images_folder(data, model, names) or Path("images")
-    options = ParserOptions(images_path=folder, colmap_path=model, downscale_factor=1, eval_mode="interval")
-    if not names or folder == Path():  # The smaller copies of images right in the capture would lie outside of it.
-        return options
-    image, copies = data / folder / names[0], lambda by: images.smaller_folder(data / folder, by) / names[0]
-    factor = images.automatic_factor(image, copies)
-    rounding = images.rounding_of(image, copies(factor), factor)
-    return dataclasses.replace(options, downscale_factor=factor, downscale_rounding_mode=rounding)
-
-
 def _camera(camera: colmap.Camera, where: str) -> Camera:
     """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
-    model, params, number = camera.model, camera.params, colmap.CAMERA_PARAMETERS.get(camera.model)
+    model = camera.model
+    params = camera.params
+    number = colmap.CAMERA_PARAMETERS.get(camera.model)
     if number is None or model in UNSUPPORTED_CAMERAS:
         problem = f"{where} has the model {model}, which nerfstudio cannot read"
         raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
@@ -170,7 +161,9 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
     check_positive(values, where, list(values))
     if not np.isfinite(params).all() or len(params) != number:
         raise InputError(f"{where} has {params} instead of {number} finite parameters: run COLMAP's mapper again.")
-    fx, fy, (cx, cy, *rest) = params[0], params[focals - 1], params[focals:]
+    fx = params[0]
+    fy = params[focals - 1]
+    (cx, cy, *rest) = params[focals:]
     radial, tangential = (rest[:2], rest[2:]) if model == "OPENCV" else (rest, ())
     return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), "FISHEYE" in model)
 

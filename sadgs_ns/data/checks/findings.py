@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sadgs_ns.errors import InputError, reason
+from sadgs_ns.data.layouts import unreadable
+from sadgs_ns.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,6 @@ def collect_findings(check: Callable[..., Iterator[Finding]]) -> Callable[..., l
             return [fault(unreadable(error))]
 
     return findings
-
-
-def unreadable(error: OSError) -> str:
-    """Return the sentence for a folder that may not be entered, or a name that is too long to be one."""
-    return f"{error.filename} cannot be read ({reason(error)}): correct its name or rights."
 
 
 def and_more(where: object, count: int) -> str:

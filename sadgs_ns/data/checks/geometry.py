@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
-from sadgs_ns.data.checks.images import read_small
+from sadgs_ns.data.images import read_small
+from sadgs_ns.data.views import NO_COEFFICIENTS, Camera, View
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
@@ -24,59 +22,9 @@ _FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, wh
 _WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
 """Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
 _FARTHEST_CENTER = 10  # Distance in image sizes at which a principal point is a mistake, and not due to a crop
-NO_COEFFICIENTS = (
-    "with all distortion coefficients 0, and nerfstudio undistorts no such image: undistort the images yourself, or "
-    "give one coefficient a tiny value (k1 = 1e-9)."
-)
-"""The rest of a sentence about a fisheye camera."""
 _STRONGEST_DISTORTION = 2.0  # Quotient of distorted and undistorted radius from which OpenCV's undistortion diverges
 _LEAST_FIT = 0.15  # Correlation of points' and photos' colours: 0.36 to 0.78 in eight captures, else mostly under 0.1
 _LEAST_SPREAD = 4  # Standard deviation of colours in 0 … 255, under which they tell nothing
-
-
-@dataclass(frozen=True)
-class Camera:
-    """Intrinsics of a camera, as all layouts give them."""
-
-    width: int  # Size of the image in px
-    height: int
-    fx: float  # Focal lengths in px
-    fy: float
-    cx: float  # Distance of the principal point from the left and the upper edge in px
-    cy: float
-    radial: tuple[float, ...] = ()  # Coefficients k1, k2, … of OpenCV's polynomial of the radius, or a fisheye's angle
-    tangential: tuple[float, ...] = ()  # Coefficients p1, p2 as OpenCV defines them
-    fisheye: bool = False
-
-
-class View(NamedTuple):
-    """A camera at its place."""
-
-    where: str  # The start of a sentence about its pose: file and image
-    where_camera: str  # The start of a sentence about its camera
-    rotation: NDArray[np.float64]  # Rotation from world to camera, in OpenCV's axes. [3, 3]
-    centre: NDArray[np.float64]  # Position of the camera in world units. [3]
-    camera: Camera
-    image: Path | None = None  # None if it shall not be opened
-
-
-def check_positive(values: Mapping[str, Any], where: str, names: Sequence[str]) -> None:
-    """Raise InputError unless the named values are finite numbers, sizes whole and all but the centre positive."""
-    for name in names:
-        if name not in values:
-            raise InputError(f"{where} has no {name}: give it one, for all frames or this one.")
-        value = finite(values[name], name, where)
-        if name not in ("cx", "cy") and value <= 0:
-            raise InputError(f"{where} has {name} = {value}, which must be positive: correct it.")
-        if name in ("w", "h") and value != int(value):
-            raise InputError(f"{where} has {name} = {value}, which is no whole number of pixels: correct it.")
-
-
-def finite(value: Any, name: str, where: str) -> float:
-    """Return a JSON value that is a finite number; raise InputError if it is not."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max:
-        return value
-    raise InputError(f"{where} has {name} = {value!r:.60}, which is no finite number: correct it.")
 
 
 def check_views(views: Sequence[View], training: int, source: Path) -> Generator[Finding, None, bool]:
@@ -125,13 +73,15 @@ def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
 
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
-    width, height = camera.width, camera.height
+    width = camera.width
+    height = camera.height
     off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
     if off > 0.5 or max(camera.cx, camera.cy) <= 1:  # The latter are shares of the image, or were not known.
         place = f"{'outside' if off > 0.5 else 'in a corner of'} its image of {width} × {height} px"
         center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, {place}"
         yield (fault if off > _FARTHEST_CENTER else warning)(f"{where} has {center}: correct cx and cy, in pixels.")
-    half_width, half_height = width / 2 / camera.fx, height / 2 / camera.fy
+    half_width = width / 2 / camera.fx
+    half_height = height / 2 / camera.fy
     angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
     if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
         focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
@@ -198,7 +148,8 @@ def check_points(points: colmap.Points, views: Sequence[View], path: Path, remed
 
 def _check_colors(points: colmap.Points, views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
     every = slice(None, None, len(points[0]) // 10_000 + 1)
-    positions, colors = points[0][every], points[1][every]
+    positions = points[0][every]
+    colors = points[1][every]
     with ThreadPoolExecutor() as pool:  # Pillow decodes in threads.
         found = pool.map(lambda view: _fit(positions, colors, view), views[:: len(views) // 8 + 1])
         fits = [fit for fit in found if fit is not None]

@@ -1,21 +1,15 @@
-"""Layouts of a capture's folder, and the sentences for folders with no known one."""
+"""The sentences for folders whose layout is not known."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import re
 import shlex
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.checks.images import Rounding, images_in
-from sadgs_ns.errors import InputError
+from sadgs_ns.data.images import images_in
+from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
+from sadgs_ns.data.transforms import GIVE_POSES
 
-COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")  # Places of a reconstruction, nerfstudio's first
 _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
     "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse"
@@ -33,76 +27,6 @@ _EXPORTS = {
     "bundle.out": (b"# Bundle", _BUNDLER),
 }
 """Files with other programs' poses, a part of their content, and the command that reads them."""
-GIVE_POSES = "compute poses with `sadgs-process PHOTOS FOLDER` or `ns-process-data`"  # A remedy where there are none
-
-
-@dataclass(frozen=True)
-class ParserOptions:
-    """Options of nerfstudio's parsers, by the names that they have there; each layout reads those of its parser."""
-
-    images_path: Path = Path("images")
-    colmap_path: Path = Path(COLMAP_FOLDERS[0])
-    masks_path: Path | None = None
-    ply_path: Path | None = None
-    downscale_factor: int | None = None
-    downscale_rounding_mode: Rounding = "floor"
-    load_3D_points: bool = True
-    eval_mode: str = "fraction"
-    train_split_fraction: float = 0.9
-    eval_interval: int = 8
-
-    def __post_init__(self) -> None:
-        if self.downscale_factor is not None and self.downscale_factor < 1:
-            raise InputError(f"downscale-factor must be at least 1, got {self.downscale_factor}.")
-
-
-def find_reconstructions(data: Path) -> dict[Path, list[str]]:
-    """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
-
-    The first is the one to read: one in a usual place, or else the one with the most images. A reconstruction right in
-    the data's folder counts if there is no other and its images are at hand. One that cannot be read has no names.
-    """
-    found: dict[Path, list[str]] = {folder: [] for folder in _model_folders(data)}
-    for folder in found:
-        with contextlib.suppress(InputError):
-            found[folder] = colmap.image_names(data / folder)
-    return dict(sorted(found.items(), key=lambda item: 0 if str(item[0]) in COLMAP_FOLDERS else 1 / (1 + len(item[1]))))
-
-
-def _model_folders(data: Path) -> list[Path]:
-    numbered = [path for place in ("colmap/sparse", "sparse") for path in sorted((data / place).glob("[0-9]*"))]
-    folders = (*map(Path, COLMAP_FOLDERS), Path("images"), *(path.relative_to(data) for path in numbered))
-    if found := [folder for folder in folders if colmap.model_kind(data / folder)]:
-        return found
-    kind = colmap.model_kind(data)
-    is_whole = kind and (data / f"images.{kind}").is_file()
-    return [Path()] if is_whole and images_folder(data, Path(), colmap.image_names(data)) is not None else []
-
-
-def find_cameras(data: Path) -> Path | None:
-    """Return the file with the poses that a folder or JSON file brings, or None; raises as `colmap.read_poses`."""
-    files = [data if data.suffix == ".json" else data / "transforms.json", data / "transforms_train.json"]
-    if not any(file.is_file() for file in files) and (models := find_reconstructions(data)):
-        model = next(iter(models))
-        files = [data / model / f"images.{colmap.model_kind(data / model)}"]
-    return next((file for file in files if file.is_file()), None)
-
-
-def images_folder(data: Path, model: Path, names: Sequence[str]) -> Path | None:
-    """Return the folder that has images of a reconstruction by their names, both relative to the data, or None."""
-    others = [path.name for path in data.iterdir() if not re.search(r"mask|depth|normal|_\d+$", path.name)]
-    beside = [folder / "images" for folder in (model, *model.parents)]
-    folders = map(Path, ("images", "", model, *beside, *sorted(others)))
-    return next((folder for folder in folders if any(os.path.isfile(data / folder / name) for name in names)), None)
-
-
-def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
-    """Return the layout of a capture's folder or file; None if it is unknown."""
-    if data.is_file() or (data / "transforms.json").is_file():
-        return "nerfstudio"
-    if (data / "transforms_train.json").is_file():
-        return "blender"
-    return "colmap" if _model_folders(data) else None
 
 
 def poses_elsewhere(data: Path) -> str | None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sadgs_ns.data.checks.findings import Finding, and_more, warning
-from sadgs_ns.data.checks.layouts import ParserOptions
+from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")  # nerfstudio trains on the first, `ns-train` measures the second, `ns-eval` the third

@@ -22,7 +22,8 @@ _PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting 
 
 def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:
     """Return what decides which kernels a run needs."""
-    model, sizes = pipeline.model, pipeline.datamanager.train_dataset.cameras
+    model = pipeline.model
+    sizes = pipeline.datamanager.train_dataset.cameras
     alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
     for name, optimizer in optimizers.items():
         value = model.trained_params.get(name)

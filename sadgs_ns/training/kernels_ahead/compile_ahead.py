@@ -26,7 +26,8 @@ from sadgs_ns.events import progress
 
 _FEWEST_CORES = 3  # The run itself keeps two busy
 _LONGEST = 60.0  # Seconds without progress after which the run goes on alone
-_HERE, _CARDS = Path(__file__).parent, Path("/proc/driver/nvidia/gpus")
+_HERE = Path(__file__).parent
+_CARDS = Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
 _found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options of each kernel, for forked processes
 
@@ -102,7 +103,8 @@ def find_kernels() -> None:
         return radii, means.new_ones((*shape, 2)), means.new_ones(shape), means.new_ones((*shape, 3))
 
     # gsplat would project on the GPU, and nothing counts pairs.
-    gsplat_compat.project, tiles.PairCounts.wait = project, lambda self: [1]
+    gsplat_compat.project = project
+    tiles.PairCounts.wait = lambda self: [1]
     knobs.runtime.jit_cache_hook = note
     trial.hash_kernels()
     torch.set_num_threads(1)

@@ -21,7 +21,9 @@ from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
 
-_GAUSSIANS, _SIZE = 64, 64  # Number of Gaussians, and width and height in px, with which the kernels are tried
+# Number of Gaussians, and width and height in px, with which the kernels are tried
+_GAUSSIANS = 64
+_SIZE = 64
 _DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
 
 
@@ -46,12 +48,16 @@ class Stages:
     """The stages of a training step on a few Gaussians, each a method that launches its kernels."""
 
     def __init__(self, choice: KernelChoice) -> None:
-        self.choice, self.drawing, self.views = choice, choice.drawing, choice.views
-        n, self.device = _GAUSSIANS, choice.device
+        self.choice = choice
+        self.drawing = choice.drawing
+        self.views = choice.views
+        n = _GAUSSIANS
+        self.device = choice.device
         ramp = torch.linspace(-0.5, 0.5, n, device=self.device)
         self.means = torch.stack([ramp, ramp.flip(0), torch.full_like(ramp, 2.0)], dim=-1)
         quats = self.means.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1)
-        self.scales, self.opacities = torch.full_like(self.means, 0.05), torch.full_like(ramp, 0.5)
+        self.scales = torch.full_like(self.means, 0.05)
+        self.opacities = torch.full_like(ramp, 0.5)
         self.gaussians = Gaussians(self.means, quats, self.scales, self.opacities, self.means)
         viewmats = torch.eye(4, device=self.device).repeat(self.views, 1, 1)
         intrinsics = [[_SIZE, 0.0, _SIZE / 2], [0.0, _SIZE, _SIZE / 2], [0.0, 0.0, 1.0]]
@@ -111,13 +117,15 @@ class Stages:
         factors = torch.zeros((2, sum(map(len, self.choice.updates))), device=self.device)
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
         flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.alone else ()
-        begin, noted = 0, torch.zeros(1, device=self.device)
+        begin = 0
+        nonfinite_flag = torch.zeros(1, device=self.device)
         for shapes in self.choice.updates:
-            part, begin = slice(begin, begin + len(shapes)), begin + len(shapes)
+            part = slice(begin, begin + len(shapes))
+            begin = begin + len(shapes)
             # Gradients and both moments may be the parameters themselves: they are all zero.
             values = tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes)
             adam_step(
-                values, values, values, values, factors[:, part], noted, flags,
+                values, values, values, values, factors[:, part], nonfinite_flag, flags,
                 betas=(0.9, 0.999), eps=1e-15, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 

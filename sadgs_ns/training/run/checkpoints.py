@@ -28,9 +28,7 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
     is damaged, or holds anything but a checkpoint's tensors and plain values.
     """
     try:
-        with zipfile.ZipFile(path) as file:  # torch itself does not check the checksums.
-            if (damaged := file.testzip()) is not None:
-                raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+        _check_checksums(path)
         state = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap or None)
     except Exception as error:  # Damaged archives, pickles and tensors raise different errors.
         # The rest of torch's message advises to load the file unsafely.
@@ -38,11 +36,28 @@ def read(path: Path, remedy: str = REMEDY, mmap: bool = False) -> dict[str, Any]
         raise InputError(
             f"{path} is cut off, damaged or not of tensors and plain values alone ({problem}): {remedy}."
         ) from error
-    missing = [part for part in _PARTS if not isinstance(state, dict) or part not in state]
-    if missing or type(state["step"]) is not int:
-        problem = f"it has no {missing[0]}" if missing else "its step is no number"
+    problem = _missing_part(state)
+    if problem:
         raise InputError(f"{path} is not a checkpoint that nerfstudio's trainer wrote ({problem}): {remedy}.")
     return state
+
+
+def _check_checksums(path: Path) -> None:
+    """Raise zipfile.BadZipFile if a part of the file is damaged, which torch itself does not check."""
+    with zipfile.ZipFile(path) as file:
+        damaged = file.testzip()
+    if damaged is not None:
+        raise zipfile.BadZipFile(f"wrong checksum of {damaged}")
+
+
+def _missing_part(state: Any) -> str:
+    """Say what a file lacks to be a checkpoint of nerfstudio's trainer; "" if it lacks nothing."""
+    for part in _PARTS:
+        if not isinstance(state, dict) or part not in state:
+            return f"it has no {part}"
+    if type(state["step"]) is not int:
+        return "its step is no number"
+    return ""
 
 
 def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> list[Path]:
@@ -51,65 +66,83 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
     `load_dir` is the folder of a run, or its folder of checkpoints; without `load_step` the latest one comes first.
     Raises InputError if both a folder and a file are given, or one does not exist.
     """
-    if load_dir is None:
-        if load_checkpoint is None:
-            return []
+    if load_dir is not None and load_checkpoint is not None:
+        raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
+    if load_checkpoint is not None:
         if not load_checkpoint.is_file():
             raise InputError(f"{load_checkpoint} is no file: give --load-checkpoint one, or --load-dir a run's folder.")
         return [load_checkpoint]
-    if load_checkpoint is not None:
-        raise InputError("load_dir and load_checkpoint both name where the run goes on: give one of them.")
-    steps = _checkpoints_in(load_dir)
+    if load_dir is None:
+        return []
+    paths = _checkpoints_in(load_dir)
     if load_step is None:
-        return [steps[step] for step in sorted(steps, reverse=True)]
-    if load_step not in steps:
-        there = ", ".join(map(str, sorted(steps)))
-        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {there}.")
-    return [steps[load_step]]
+        return [paths[step] for step in sorted(paths, reverse=True)]
+    if load_step not in paths:
+        steps = ", ".join(str(step) for step in sorted(paths))
+        raise InputError(f"{load_dir} holds no checkpoint of step {load_step}: give --load-step one of {steps}.")
+    return [paths[load_step]]
 
 
 def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
-    """Return the checkpoints of a run's folder, or of its folder of checkpoints, by their steps."""
+    """Return the checkpoints of a run's folder, or of its folder of checkpoints, by their steps.
+
+    Raises InputError if there is none; the sentence names the latest run in the folders below.
+    """
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
-    files = ((re.fullmatch(r"step-(\d+)\.ckpt", path.name), path) for path in sorted(load_dir.glob("*")))
-    steps = {int(match[1]): path for match, path in files if match}
-    if not steps:
-        below = [path.parent for depth in ("*", "*/*", "*/*/*") for path in load_dir.glob(f"{depth}/{_FOLDER}")]
-        latest = max(below, key=lambda run: (run / _FOLDER).stat().st_mtime, default=None)
-        example = "" if latest is None else f", such as {latest}"
-        raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
-    return steps
+    paths = {}
+    for path in sorted(load_dir.glob("*")):
+        match = re.fullmatch(r"step-(\d+)\.ckpt", path.name)
+        if match:
+            paths[int(match[1])] = path
+    if paths:
+        return paths
+    below = []
+    for depth in ("*", "*/*", "*/*/*"):
+        below += load_dir.glob(f"{depth}/{_FOLDER}")
+    example = ""
+    if below:
+        latest = max(below, key=lambda folder: folder.stat().st_mtime)
+        example = f", such as {latest.parent}"
+    raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
 
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Return a checkpoint after `change` was applied to its tensors [N, …] of Gaussians, in a fixed order."""
-    pipeline, optimizers = dict(state["pipeline"]), dict(state["optimizers"])
+    pipeline = dict(state["pipeline"])
+    optimizers = dict(state["optimizers"])
     names = sorted(name for name in pipeline if ".gauss_params." in name)
-    pipeline |= {name: change(pipeline[name]) for name in names}
-    for name in sorted(key for name in names if (key := name.rpartition(".")[2]) in optimizers):
-        moments = {index: _rows(values, change) for index, values in sorted(optimizers[name]["state"].items())}
-        optimizers[name] = {**optimizers[name], "state": moments}
+    for name in names:
+        pipeline[name] = change(pipeline[name])
+    for name in sorted(name.rpartition(".")[2] for name in names):
+        if name in optimizers:
+            states = sorted(optimizers[name]["state"].items())
+            moments = {index: _map_tensors(values, change) for index, values in states}
+            optimizers[name] = {**optimizers[name], "state": moments}
     if "_model._extra_state" in pipeline:
-        extra = pipeline["_model._extra_state"]
-        statistics, average = _rows(extra["strategy_state"], change), extra["average"]
-        average = {**average, "means": _rows(average["means"], change)}
-        pipeline["_model._extra_state"] = {**extra, "strategy_state": statistics, "average": average}
+        extra = dict(pipeline["_model._extra_state"])
+        extra["strategy_state"] = _map_tensors(extra["strategy_state"], change)
+        means = _map_tensors(extra["average"]["means"], change)
+        extra["average"] = {**extra["average"], "means": means}
+        pipeline["_model._extra_state"] = extra
     return {**state, "pipeline": pipeline, "optimizers": optimizers}
 
 
-def _rows(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
-    """Change tensors that have rows, which Adam's number of steps has not."""
-    return {
-        key: change(value) if isinstance(value, Tensor) and value.dim() > 0 else value
-        for key, value in sorted(values.items())
-    }
+def _map_tensors(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Apply `change` to tensors that have rows; Adam's number of steps is a tensor without rows."""
+    changed = {}
+    for key, value in sorted(values.items()):
+        if isinstance(value, Tensor) and value.dim() > 0:
+            value = change(value)
+        changed[key] = value
+    return changed
 
 
 def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
     """Save a checkpoint whole, and delete the run's others unless they are to be kept. Raises WriteError."""
     path = folder / f"step-{step:09d}.ckpt"
-    others = [other for other in folder.glob(f"step-{9 * '[0-9]'}.ckpt") if other != path]  # no user's copy.ckpt
+    digits = 9 * "[0-9]"  # A copy that a user has made has another name, and is no checkpoint of the run.
+    others = [other for other in folder.glob(f"step-{digits}.ckpt") if other != path]
     with atomic_path(path, beside=folder) as partial:  # nerfstudio takes every file inside for a checkpoint.
         try:
             torch.save(state, partial)
@@ -118,15 +151,17 @@ def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
         if others:  # The new checkpoint must survive a power cut before these are deleted.
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())
-    for other in [] if keep else others:
-        other.unlink()
+    if not keep:
+        for other in others:
+            other.unlink()
 
 
 def check_chosen(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
     """Raise InputError if none of the files for `read_chosen` is whole; their content is not read."""
-    tried = checkpoint_paths(load_dir, load_step, load_checkpoint)
-    if tried and not any(map(zipfile.is_zipfile, tried)):  # A zip file's table of contents is at its end.
-        read(tried[0])  # raises the error that says what is wrong
+    paths = checkpoint_paths(load_dir, load_step, load_checkpoint)
+    # A zip file's table of contents is at its end, so a file that was cut off has none.
+    if paths and not any(zipfile.is_zipfile(path) for path in paths):
+        read(paths[0])  # This raises the error that says what is wrong.
 
 
 def read_chosen(

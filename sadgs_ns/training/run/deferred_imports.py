@@ -7,8 +7,8 @@ by a stand-in, which imports the real module when something asks for it. Later i
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -60,32 +60,51 @@ class StandIn(ModuleType):
         return self._find()(*arguments, **options)
 
 
-def import_nerfstudio() -> None:
-    """Import nerfstudio's trainer, model and parsers with stand-ins for what `DEFERRED` names."""
-    general = torch.broadcast_shapes
+class TorchForCameras(ModuleType):
+    """torch, but with a `broadcast_shapes` that imports nothing.
 
+    nerfstudio broadcasts the shapes of each batch of cameras. torch's function imports sympy for sizes that may be
+    unknown, which takes a third of a second.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(torch, name)
+
+    @staticmethod
     def broadcast_shapes(*shapes: Any) -> torch.Size:
-        """Broadcast shapes as torch does, which imports sympy for sizes that may be unknown; cameras need it."""
+        """Broadcast shapes as torch does, and raise RuntimeError as torch does."""
         try:
             return torch.Size(np.broadcast_shapes(*shapes))
         except (TypeError, ValueError):
-            return general(*shapes)
+            return torch.broadcast_shapes(*shapes)
 
-    torch.broadcast_shapes = broadcast_shapes
+
+def import_nerfstudio() -> None:
+    """Import nerfstudio's trainer, model and parsers with stand-ins for what `DEFERRED` names."""
     try:
         for importer, names in DEFERRED.items():
             StandIn.importing = bool(names)  # Other packages may need what they ask for.
-            true = {name: sys.modules[name] for name in names if name in sys.modules}
-            for name in names:
-                sys.modules[name] = stand_in = StandIn(name, lambda name=name: import_module(name))
-                parent, _, child = name.rpartition(".")
-                if parent in names:
-                    setattr(sys.modules[parent], child, stand_in)
-            try:
-                import_module(importer)
-            finally:
-                for name in names:
-                    del sys.modules[name]
-                sys.modules.update(true)
+            _import_with_stand_ins(importer, names)
     finally:
         StandIn.importing = False
+    from nerfstudio.utils import tensor_dataclass
+
+    # Only this module sees it; torch itself stays as it is.
+    tensor_dataclass.torch = TorchForCameras("torch")  # pyright: ignore[reportPrivateImportUsage]
+
+
+def _import_with_stand_ins(importer: str, names: Sequence[str]) -> None:
+    """Import a module while stand-ins have the places of others, by their names."""
+    imported_before = {name: sys.modules[name] for name in names if name in sys.modules}
+    for name in names:
+        stand_in = StandIn(name, partial(import_module, name))
+        sys.modules[name] = stand_in
+        parent, _, child = name.rpartition(".")
+        if parent in names:
+            setattr(sys.modules[parent], child, stand_in)
+    try:
+        import_module(importer)
+    finally:
+        for name in names:
+            del sys.modules[name]
+        sys.modules.update(imported_before)

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
 from sadgs_ns import host_memory
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
-from sadgs_ns.method import memory
-from sadgs_ns.method.memory import StepSize
 from sadgs_ns.method.ops import Params
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render import step_memory as memory
+from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.training.run.processes import least, number_of_processes, processes_on_this_machine
 from sadgs_ns.training.step.structure_cache import PIXELS_PER_BATCH
 
@@ -22,8 +25,8 @@ PLANNED_SHARE = 0.8  # Share of the available memory to plan with; the rest is f
 QUANTIZED_BYTES = 3  # Bytes that S̄ takes for each pixel of the training images (`method.quantization`)
 STRUCTURE_PIXEL_BYTES = 300  # Bytes that a pixel takes at most while S̄ is computed
 MANY_IMAGES = 500  # Up to this many training images nerfstudio would keep on the device, however large they are
-IMAGE_SHARE, FEW_IMAGES_SHARE = 0.25, 0.5
-"""Largest shares of the device's free memory for the images if there are more than `MANY_IMAGES`, and if not."""
+IMAGE_SHARE = 0.25  # Largest share of the device's free memory for the images if there are more than `MANY_IMAGES`
+FEW_IMAGES_SHARE = 0.5  # The same if there are no more
 HOST_SHARE = 0.5
 """Largest share of the host's free memory for decoded images, of which torch rounds pinned ones up to powers of two."""
 
@@ -41,53 +44,78 @@ def training_size(datamanager: FullImageDatamanager, views: int, processes: int 
     """Measure a run with this many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
+    pixels = math.ceil(views * largest / processes)  # A process composites its share.
+    step = StepSize(views, pixels, exchanged=processes > 1)
     if datamanager.config.cache_images == "gpu":
-        kept, structure = image_bytes(datamanager), 0.0
-    else:  # The images of the next step are there, too. A process has those that it composites, and S̄ of all.
-        sizes = torch.cat([cameras.height, cameras.width], dim=-1).unique(dim=0).tolist()
-        here = views  # A process may have a part of each view if there are several sizes.
-        if len(sizes) == 1:
-            here = max(len(views_of_rank((*map(tuple, sizes),) * views, processes, r)) for r in range(processes))
-        kept = float((3 * here + QUANTIZED_BYTES * views) * largest)
-        structure = float(STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest)))
-    pixels = -(-views * largest // processes)  # A process composites its share.
-    return TrainingSize(kept, StepSize(views, pixels, exchanged=processes > 1), structure)
+        return TrainingSize(image_bytes(datamanager), step)
+    sizes = [(height, width) for height, width in torch.cat([cameras.height, cameras.width], dim=-1).tolist()]
+    here = _most_views_of_a_process(sizes, views, processes)
+    # The images of the next step are there, too. A process has those that it composites, and S̄ of all.
+    kept = (3 * here + QUANTIZED_BYTES * views) * largest
+    structure = STRUCTURE_PIXEL_BYTES * max(largest, min(PIXELS_PER_BATCH, here * largest))
+    return TrainingSize(float(kept), step, float(structure))
+
+
+def _most_views_of_a_process(sizes: Sequence[tuple[int, int]], views: int, processes: int) -> int:
+    """Return how many of a step's views a process composites rows of, at most; `sizes` are of all training views."""
+    if len(set(sizes)) > 1:
+        return views  # A process may have a part of each view.
+    of_step = (sizes[0],) * views
+    return max(len(views_of_rank(of_step, processes, rank)) for rank in range(processes))
 
 
 def image_bytes(datamanager: FullImageDatamanager) -> float:
-    """Bytes of all images, held-out ones too, and of S̄ of the training images."""
-    train, held_out = (
-        float((cameras.height * cameras.width).sum())
-        for cameras in (datamanager.train_dataset.cameras, datamanager.eval_dataset.cameras)
-    )  # px
+    """Return the bytes of all images, held-out ones too, and of S̄ of the training images."""
+    train = _pixels_of(datamanager.train_dataset.cameras)
+    held_out = _pixels_of(datamanager.eval_dataset.cameras)
     return 3 * (train + held_out) + QUANTIZED_BYTES * train
 
 
-def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> str | None:
+def _pixels_of(cameras: Cameras) -> float:
+    """Return the number of pixels of all images of these cameras."""
+    return float((cameras.height * cameras.width).sum())
+
+
+@dataclass(frozen=True)
+class ImageStorage:
+    """Where a run keeps its images."""
+
+    where: str  # A value of the datamanager's option `cache_images`
+    sentence: str = ""  # What to tell the user; empty if the images are kept where the options ask for
+
+
+def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device) -> ImageStorage:
     """Choose where the images are kept, by the free memory, alike in all processes; call before they are loaded.
 
-    Returns a line for the user; None if images are kept on the device, or where the user said.
+    The option `cache_images` must be "gpu" or "cpu". The caller applies what is returned.
     """
-    config, size, sharing = datamanager.config, image_bytes(datamanager), processes_on_this_machine()
-    host = least(host_memory.available_host_bytes() / sharing, device)
+    requested: str = datamanager.config.cache_images
+    size = image_bytes(datamanager)
+    host_free = least(host_memory.available_host_bytes() / processes_on_this_machine(), device)
+    fits_host = size <= HOST_SHARE * host_free
     needs = f"decoded images and their structure take {size / 1e9:.2g} GB"
+    on_host = "The images stay in the host's memory and are copied ahead of the steps"
     compressed = "The images stay compressed and are decoded ahead of the steps"
-    if config.cache_images == "cpu":
+    if requested == "cpu":
         # Several processes would each decode all images.
-        if number_of_processes() == 1 or size <= HOST_SHARE * host:
-            return None
-        config.cache_images = "compressed"  # type: ignore[assignment]
-        return f"{compressed}: {needs} in each process, and the host has {host / 1e9:.2g} GB free for each."
-    free, share, name = host, HOST_SHARE, "the host"
-    if device.type == "cuda":
-        share = IMAGE_SHARE if len(datamanager.train_dataset) > MANY_IMAGES else FEW_IMAGES_SHARE
-        free, name = least(memory.available_bytes(device)[0], device), "the GPU"
-    if size <= share * free:
-        return None
-    fits_host = device.type == "cuda" and size <= HOST_SHARE * host
-    config.cache_images = "cpu" if fits_host else "compressed"  # type: ignore[assignment]
-    where = "The images stay in the host's memory and are copied ahead of the steps" if fits_host else compressed
-    return f"{where}: {needs}, and {name} has {free / 1e9:.2g} GB free."
+        if fits_host or number_of_processes() == 1:
+            return ImageStorage(requested)
+        free = f"the host has {host_free / 1e9:.2g} GB free for each"
+        return ImageStorage("compressed", f"{compressed}: {needs} in each process, and {free}.")
+    if device.type != "cuda":
+        if fits_host:
+            return ImageStorage(requested)
+        return ImageStorage("compressed", f"{compressed}: {needs}, and the host has {host_free / 1e9:.2g} GB free.")
+    share = FEW_IMAGES_SHARE
+    if len(datamanager.train_dataset) > MANY_IMAGES:
+        share = IMAGE_SHARE
+    device_free = least(memory.available_bytes(device)[0], device)
+    if size <= share * device_free:
+        return ImageStorage(requested)
+    reason = f"{needs}, and the GPU has {device_free / 1e9:.2g} GB free"
+    if fits_host:
+        return ImageStorage("cpu", f"{on_host}: {reason}.")
+    return ImageStorage("compressed", f"{compressed}: {reason}.")
 
 
 def fit_to_memory(
@@ -100,27 +128,36 @@ def fit_to_memory(
     """Lower the cap of Gaussians to what the budget, or the device's free memory, holds; call before the first step.
 
     A cap below the present number adds no Gaussian and removes none. Without a budget, only the default of
-    `max_gaussians` is lowered; without CUDA, nothing is. Returns the cap and a line; raises InputError if none fit.
+    `max_gaussians` is lowered; without CUDA, nothing is.
+
+    Returns the cap of all processes and a sentence for the user. Raises InputError if the budget holds no Gaussian.
     """
-    device, n = params["means"].device, len(params["means"])
+    device = params["means"].device
+    n = len(params["means"])
     free, total = memory.available_bytes(device)
     if math.isinf(free):
         return cap, f"At most {cap:,} Gaussians: this device's memory is not planned with, so this is max_gaussians."
     state = empty_state(0, device)
-    each = memory.kept_bytes(params, state) + memory.widest_bytes(params)
+    bytes_of_one = memory.kept_bytes(params, state) + memory.widest_bytes(params)
 
     def need(num_gaussians: int) -> float:
+        """Return the bytes that a process with so many Gaussians needs at most."""
         step = replace(size.step, pairs=memory.PAIRS_PER_GAUSSIAN * size.step.views * num_gaussians)
         working = max(size.structure_bytes, *memory.step_bytes(num_gaussians, step, device).values())
-        return size.image_bytes + each * num_gaussians + working
+        return size.image_bytes + bytes_of_one * num_gaussians + working
 
     why = ""
     if budget_gb is not None or cap == StructureAwareStrategy.max_gaussians:
-        budget = PLANNED_SHARE * free if budget_gb is None else min(1e9 * budget_gb, free)
-        none = {name: value[:0] for name, value in params.items()}
+        if budget_gb is None:
+            budget = PLANNED_SHARE * free
+            limit = f"{free / 1e9:.1f} GB are free"
+        else:
+            budget = min(1e9 * budget_gb, free)
+            limit = f"memory_budget_gb is {budget_gb:g}"
+        no_gaussians = {name: value[:0] for name, value in params.items()}
         left = budget - size.image_bytes
-        affordable = memory.affordable_growth(none, state, left, size.step)  # type: ignore[arg-type]
-        affordable = processes * min(affordable, (left - size.structure_bytes) / each)
+        rendered = memory.affordable_growth(no_gaussians, state, left, size.step)  # type: ignore[arg-type]
+        affordable = processes * min(rendered, (left - size.structure_bytes) / bytes_of_one)
         if budget_gb is not None and affordable < 1:
             raise InputError(
                 f"pipeline.memory_budget_gb is {budget_gb:g} and leaves no room for Gaussians: images and rendering "
@@ -129,8 +166,11 @@ def fit_to_memory(
             )
         if affordable < cap:
             cap = max(int(affordable), 1)
-            why = f"; {free / 1e9:.1f} GB are free" if budget_gb is None else f"; memory_budget_gb is {budget_gb:g}"
+            why = f"; {limit}"
             if cap < n * processes:
                 why += f", which holds no more than the {n * processes:,} at the start: none will be added"
-    needed, card = need(max(-(-cap // processes), n)), "the card" if processes == 1 else "each card"
+    needed = need(max(math.ceil(cap / processes), n))
+    card = "the card"
+    if processes > 1:
+        card = "each card"
     return cap, f"At most {cap:,} Gaussians: {needed / 1e9:.1f} GB of {card}'s {total / 1e9:.1f} GB{why}."

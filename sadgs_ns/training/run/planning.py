@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.memory_plan import fit_to_memory, training_size
@@ -24,29 +28,58 @@ LEAST_PIXELS = 1.5e6
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
+def decide_near_plane(pipeline: SadgsPipeline, before: RunPlan | None) -> float:
+    """Return the depth from which Gaussians are drawn: the option's, the one of the plan `before`, or the scene's.
+
+    Call this before images are undistorted, which changes the cameras' intrinsics and sizes.
+    """
+    model = pipeline.model
+    if model.config.near_plane is not None:
+        return model.config.near_plane
+    if before is not None:
+        return before.near_plane
+    points = model.means.new_zeros((0, 3))
+    if model.seed_points is not None:
+        points = model.seed_points[0].to(model.means)
+    cameras = pipeline.datamanager.train_dataset.cameras
+    viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+    sizes = torch.cat([cameras.width, cameras.height], dim=-1)
+    extent = float(model.strategy_state["scene_scale"])
+    return scene_near_plane(points, viewmats, cameras.get_intrinsics_matrices(), sizes, extent)
+
+
 def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) -> Schedule:
-    """Decide iterations and views a step: by options, by an equal effort's plan `before`, or by rule."""
-    effort, iterations, in_step = config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration
-    if before is not None and before.requested["effort"] == effort:
-        iterations = before.iterations if iterations is None else iterations
-        in_step = before.views_per_iteration if in_step is None else in_step
-    return schedule(views, effort=effort, iterations=iterations, views_per_iteration=in_step)
+    """Decide iterations and views a step for a number of training views.
+
+    Options decide, or else the plan `before` of the checkpoint's run if its effort was the same, or else rules.
+    """
+    effort = config.pipeline.effort
+    iterations = config.max_num_iterations
+    views_per_iteration = config.pipeline.views_per_iteration
+    if before is not None and before.requested.get("effort", effort) == effort:
+        if iterations is None:
+            iterations = before.iterations
+        if views_per_iteration is None:
+            views_per_iteration = before.views_per_iteration
+    return schedule(views, effort=effort, iterations=iterations, views_per_iteration=views_per_iteration)
 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
     """Tell whether steps of this many views have too few pixels for several devices, and print it."""
-    pixels = views * _pixels(cameras)
-    if pixels >= LEAST_PIXELS * devices:
+    pixels = views * _mean_pixels(cameras)
+    needed = LEAST_PIXELS * devices
+    if pixels >= needed:
         return False
     note(
         f"Training on one device: a step draws {pixels / 1e6:.2f} megapixels, and {devices} devices are expected to be "
-        f"quicker from {LEAST_PIXELS * devices / 1e6:.1f} on (docs/results.md). If one device does not hold the "
+        f"quicker from {needed / 1e6:.1f} on (docs/results.md). If one device does not hold the "
         "Gaussians, set --share-always True."
     )
     return True
 
 
-def _pixels(cameras: Cameras) -> float:
+def _mean_pixels(cameras: Cameras) -> float:
+    """Return the mean number of pixels of the cameras' images."""
     return float((cameras.height * cameras.width).double().mean())
 
 
@@ -55,6 +88,7 @@ def plan_run(
     pipeline: SadgsPipeline,
     length: Schedule,
     *,
+    near_plane: float,
     dense: bool,
     before: RunPlan | None,
     done: int,
@@ -64,71 +98,129 @@ def plan_run(
     The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
     is the plan of the checkpoint's run, after `done` iterations. Raises InputError if the memory holds no Gaussians.
     """
-    options, model = config.pipeline, pipeline.model
-    strategy, cap = options.model.strategy, options.model.strategy.max_gaussians
-    requested = {name: getattr(options, name) for name in ("effort", "views_per_iteration", "memory_budget_gb")}
-    requested |= {f"model.strategy.{name}": value for name, value in asdict(strategy).items()}
-    old = requested if before is None else requested | before.requested
-    changed = [f"pipeline.{name} was {old[name]} and is {now}" for name, now in requested.items() if old[name] != now]
-    if changed:
-        warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
-    if strategy.refine_stop_iter != 0:
-        cap = _cap_in_memory(options, pipeline, length.views_per_iteration)
-        same = all(requested[name] == old[name] for name in _CAP_OPTIONS)
-        if before is not None and same and cap > before.strategy.max_gaussians:
-            cap = before.strategy.max_gaussians
-            note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
-    of_effort, of_start = growth_threshold(options.effort), DENSE_THRESHOLDS if dense else 1.0
-    clone, split = (of_effort * t * of_start for t in (strategy.clone_grad2d, strategy.split_absgrad2d))
-    planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone, split_absgrad2d=split)
-    planned = planned.for_run(length.iterations)
-    windows = planned.windows
-    if windows.refine_stop_iter < windows.structure_every and strategy.refine_stop_iter != 0:
-        warn(
-            f"{length.iterations} iterations are too few for a structure-aware split: densification ends at "
-            f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
-            "Train longer or lower pipeline.model.strategy.structure-every."
-        )
+    requested = _requested_options(config.pipeline)
+    _warn_of_other_settings(requested, before)
+    strategy = _plan_strategy(pipeline, length, requested, dense, before)
     _print_length(config, pipeline, length, done)
-    extent, groups = float(model.strategy_state["scene_scale"]), pipeline.get_param_groups()
+    extent = float(pipeline.model.strategy_state["scene_scale"])
+    groups = pipeline.get_param_groups()
     optimizers = {name: group for name, group in config.optimizers.items() if name in groups}
     return RunPlan(
         **vars(length),
-        devices=model.world.num_ranks,
+        devices=pipeline.model.world.num_ranks,
         images=pipeline.datamanager.config.cache_images,
-        near_plane=model.near_plane if options.model.near_plane is None else options.model.near_plane,
-        max_off_axis=options.model.max_off_axis,
-        strategy=planned,
+        near_plane=near_plane,
+        max_off_axis=config.pipeline.model.max_off_axis,
+        strategy=strategy,
         rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
         requested=requested,
     )
 
 
+def _requested_options(options: SadgsPipelineConfig) -> dict[str, Any]:
+    """Return the options from which a plan is derived, by their names after `pipeline.`."""
+    requested: dict[str, Any] = {
+        "effort": options.effort,
+        "views_per_iteration": options.views_per_iteration,
+        "memory_budget_gb": options.memory_budget_gb,
+    }
+    for name, value in asdict(options.model.strategy).items():
+        requested[f"model.strategy.{name}"] = value
+    return requested
+
+
+def _warn_of_other_settings(requested: Mapping[str, Any], before: RunPlan | None) -> None:
+    """Print which options had other values in the checkpoint's run."""
+    if before is None:
+        return
+    changed = []
+    for name, value in requested.items():
+        value_before = before.requested.get(name, value)  # An earlier version may not have had the option.
+        if value_before != value:
+            changed.append(f"pipeline.{name} was {value_before} and is {value}")
+    if changed:
+        warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
+
+
+def _plan_strategy(
+    pipeline: SadgsPipeline, length: Schedule, requested: Mapping[str, Any], dense: bool, before: RunPlan | None
+) -> StructureAwareStrategy:
+    """Return the strategy's options with a cap that the memory holds, the run's thresholds and its windows."""
+    options = pipeline.config
+    strategy = options.model.strategy
+    densifies = strategy.refine_stop_iter != 0
+    cap = strategy.max_gaussians
+    if densifies:
+        cap = _cap_in_memory(pipeline, length.views_per_iteration)
+        if before is not None and cap > before.strategy.max_gaussians and _asks_for_same_cap(requested, before):
+            cap = before.strategy.max_gaussians
+            note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
+    of_effort = growth_threshold(options.effort)
+    of_start = 1.0
+    if dense:
+        of_start = DENSE_THRESHOLDS
+    planned = replace(
+        strategy,
+        max_gaussians=cap,
+        clone_grad2d=of_effort * strategy.clone_grad2d * of_start,
+        split_absgrad2d=of_effort * strategy.split_absgrad2d * of_start,
+    ).fitted(length.iterations)
+    windows = planned.windows
+    if densifies and windows.refine_stop_iter < windows.structure_every:
+        warn(
+            f"{length.iterations} iterations are too few for a structure-aware split: densification ends at "
+            f"{windows.refine_stop_iter}, the first split would come at {windows.structure_every}. "
+            "Train longer or lower pipeline.model.strategy.structure-every."
+        )
+    return planned
+
+
+def _cap_in_memory(pipeline: SadgsPipeline, views: int) -> int:
+    """Return the cap of Gaussians that the devices' memory allows in steps of so many views; print what decided it."""
+    params: Any = pipeline.model.gauss_params
+    world = pipeline.model.world
+    requested = pipeline.config.model.strategy.max_gaussians
+    size = training_size(pipeline.datamanager, views, world.num_ranks)
+    cap, sentence = fit_to_memory(requested, params, size, pipeline.config.memory_budget_gb, world.num_ranks)
+    note(sentence)
+    return int(world.least(cap))
+
+
+def _asks_for_same_cap(requested: Mapping[str, Any], before: RunPlan) -> bool:
+    """Tell whether the options that decide the cap of Gaussians are those of the checkpoint's run."""
+    return all(before.requested.get(name, requested[name]) == requested[name] for name in _CAP_OPTIONS)
+
+
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
     """Print how long the run is, and what decided it."""
-    cameras, effort = pipeline.datamanager.train_dataset.cameras, config.pipeline.effort
-    requested = config.pipeline.views_per_iteration
-    views, in_step, iterations = len(cameras), length.views_per_iteration, length.iterations
-    steps_done, times = f", of which {done:,} are done" if done else "", round(iterations * in_step / views)
+    cameras = pipeline.datamanager.train_dataset.cameras
+    views = len(cameras)
+    in_step = length.views_per_iteration
+    steps = f"{length.iterations:,} iterations of {in_step} {_plural('view', in_step)}"
+    if done:
+        steps += f", of which {done:,} are done"
+    times = round(length.iterations * in_step / views)
     note(
-        f"{config.method_name} on {views:,} training views of {_pixels(cameras) / 1e6:.2g} megapixels: "
-        f"{iterations:,} iterations of {in_step} view{'s' * (in_step > 1)}{steps_done}, so that each view is rendered "
-        f"about {times:,} time{'s' * (times != 1)}."
+        f"{config.method_name} on {views:,} training views of {_mean_pixels(cameras) / 1e6:.2g} megapixels: "
+        f"{steps}, so that each view is rendered about {times:,} {_plural('time', times)}."
     )
     if config.max_num_iterations is None:
-        note(f"The number of views and --pipeline.effort {effort:g} decide this: 0.5 is a draft, and 2 resolves more.")
+        note(
+            f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft, and 2 "
+            "resolves more."
+        )
+    requested = config.pipeline.views_per_iteration
     if requested is not None and requested > in_step:
-        told = f"pipeline.views_per_iteration is {requested}, but there are {views} training views"
-        warn(f"{told}: all are taken each time.")
+        warn(
+            f"pipeline.views_per_iteration is {requested}, but there are {views} training views: all are taken each "
+            "time."
+        )
     if pipeline.device.type == "cpu":
         warn(cpu_notice(torch.get_num_threads()))
 
 
-def _cap_in_memory(options: SadgsPipelineConfig, pipeline: SadgsPipeline, views: int) -> int:
-    """Return the cap of Gaussians that the devices' memory allows, and print what decided it."""
-    params: Any = pipeline.model.gauss_params
-    world, cap = pipeline.model.world, options.model.strategy.max_gaussians
-    size = training_size(pipeline.datamanager, views, world.num_ranks)
-    cap, line = fit_to_memory(cap, params, size, options.memory_budget_gb, world.num_ranks)
-    note(line)
-    return int(world.least(cap))
+def _plural(noun: str, number: int) -> str:
+    """Return a noun as it stands after a number."""
+    if number == 1:
+        return noun
+    return f"{noun}s"

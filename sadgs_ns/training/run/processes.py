@@ -29,12 +29,16 @@ _TIMEOUT = timedelta(minutes=30)  # Longest wait for another process: rank 0 may
 
 def number_of_processes() -> int:
     """Return how many processes train together; 1 if neither torchrun nor nerfstudio started several."""
-    return dist.get_world_size() if dist.is_initialized() else int(os.environ.get("WORLD_SIZE", "1"))
+    if dist.is_initialized():
+        return dist.get_world_size()
+    return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 def is_rank_zero() -> bool:
     """Tell whether this process is the one that prints and writes files."""
-    return (dist.get_rank() if dist.is_initialized() else int(os.environ.get("RANK", "0"))) == 0
+    if dist.is_initialized():
+        return dist.get_rank() == 0
+    return int(os.environ.get("RANK", "0")) == 0
 
 
 def processes_on_this_machine() -> int:
@@ -44,7 +48,9 @@ def processes_on_this_machine() -> int:
 
 def least(number: float, device: torch.device) -> float:
     """Return the smallest number, perhaps infinite, that any process of the run passes, so that all decide alike."""
-    return World(device if dist.is_initialized() else None).least(number)
+    if not dist.is_initialized():
+        return number
+    return World(device).least(number)
 
 
 def check_devices(machine: MachineConfig) -> bool:
@@ -57,12 +63,14 @@ def check_devices(machine: MachineConfig) -> bool:
     ]
     check_ranges("machine.", machine, ranges)
     if machine.num_devices > 1 and machine.device_type != "cuda":
-        several = f"machine.num_devices is {machine.num_devices}"
-        problem = f"{several}, and nerfstudio starts several processes with CUDA only"
-        raise InputError(f"{problem}: set it to 1, or start the run with torchrun.")
+        raise InputError(
+            f"machine.num_devices is {machine.num_devices}, and nerfstudio starts several processes with CUDA only: "
+            "set it to 1, or start the run with torchrun."
+        )
     if machine.num_devices == 1 and number_of_processes() == 1:
         return False
-    wanted, found = max(machine.num_devices, processes_on_this_machine()), torch.cuda.device_count()
+    wanted = max(machine.num_devices, processes_on_this_machine())
+    found = torch.cuda.device_count()
     if machine.device_type == "cuda" and wanted > found:
         problem = f"The run is to take {wanted} CUDA devices of this machine, and torch finds {found}"
         raise InputError(f"{problem}: lower machine.num_devices, or torchrun's --nproc-per-node.")
@@ -78,7 +86,9 @@ class Peers:
         dist.all_gather_object(self._places, own)
 
     def on_one_machine(self) -> bool:
-        return len({host for host, _ in self._places}) == 1
+        """Tell whether all processes run on the same host."""
+        hosts = {host for host, _ in self._places}
+        return len(hosts) == 1
 
     def exit_after_rank_zero(self) -> NoReturn:
         """Wait for the end of rank 0, because the end of one process would end all; then exit with code 0."""
@@ -91,42 +101,51 @@ class Peers:
 
     def ended(self) -> bool:
         """Tell whether a process of this machine ended, after waiting some seconds for one."""
-        end, here = time.monotonic() + _REAPED_SECONDS, socket.gethostname()
-        while all(_exists(pid) for host, pid in self._places if host == here):
+        end = time.monotonic() + _REAPED_SECONDS
+        here = socket.gethostname()
+        process_ids = [process_id for host, process_id in self._places if host == here]
+        while all(_exists(process_id) for process_id in process_ids):
             if time.monotonic() > end:
                 return False
             time.sleep(0.1)
         return True
 
 
-def _exists(pid: int) -> bool:
+def _exists(process_id: int) -> bool:
     """Tell whether a process of this user exists, or has ended without being reaped by its parent yet."""
     try:
-        os.kill(pid, 0)
+        os.kill(process_id, 0)
     except (ProcessLookupError, PermissionError):  # Another user's process may have the number by now.
         return False
     return True
 
 
 def join(config: TrainerConfig, local_rank: int) -> tuple[World, int]:
-    """Join the other processes, if there are any, with one seed for all; return them and the local rank."""
+    """Join the other processes, if there are any; return them and the local rank.
+
+    All processes then have one seed and one time stamp, which is written into `config`, and only rank 0 prints.
+    """
     if number_of_processes() == 1:
         return World(), local_rank
-    cuda = config.machine.device_type == "cuda"
-    if not dist.is_initialized():
+    started_by_torchrun = not dist.is_initialized()
+    if started_by_torchrun:
         local_rank = int(os.environ["LOCAL_RANK"])
-    if cuda:
+    device = torch.device("cpu")
+    backend = "gloo"
+    if config.machine.device_type == "cuda":
         torch.cuda.set_device(local_rank)  # NCCL, and Triton, take the current device.
-    if not dist.is_initialized():
-        dist.init_process_group("nccl" if cuda else "gloo", timeout=_TIMEOUT)
+        device = torch.device("cuda", local_rank)
+        backend = "nccl"
+    if started_by_torchrun:
+        dist.init_process_group(backend, timeout=_TIMEOUT)
     random.seed(config.machine.seed)
     np.random.seed(config.machine.seed)
     torch.manual_seed(config.machine.seed)
     CONSOLE.quiet = not is_rank_zero()
-    shared = [config.timestamp]
-    dist.broadcast_object_list(shared, 0)
-    config.timestamp = shared[0]
-    return World(torch.device("cuda", local_rank) if cuda else torch.device("cpu")), local_rank
+    timestamp = [config.timestamp]
+    dist.broadcast_object_list(timestamp, 0)
+    config.timestamp = timestamp[0]
+    return World(device), local_rank
 
 
 @contextmanager

@@ -103,10 +103,12 @@ class ProgressTable(LocalWriter):
             return
         if step % writer.GLOBAL_BUFFER["steps_per_log"] != 0:
             return
-        cells, now = _cells(events), time.monotonic()  # On CUDA the former waits for the step.
+        cells = _cells(events)  # On CUDA this waits for the step.
+        now = time.monotonic()
         self._times.append((step, now))
         self._first = self._first or self._times[0]
-        total, timing = writer.GLOBAL_BUFFER["max_iter"], ["", ""]
+        total = writer.GLOBAL_BUFFER["max_iter"]
+        timing = ["", ""]
         if step > self._times[0][0]:
             pace = (now - self._times[0][1]) / (step - self._times[0][0])
             left = time_left(self._first[0], step, total, now - self._first[1], self._times[0][0], pace)

@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.engine.trainer import TrainerConfig
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -27,20 +28,33 @@ _SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' ex
 
 @dataclass
 class Resumption:
-    """A checkpoint to load in two parts; errors are InputError, and name the file and a remedy."""
+    """A checkpoint to go on from, loaded in two parts. Errors are InputError and name the file and a remedy."""
 
     path: Path
     state: dict[str, Any]  # As nerfstudio's trainer writes it
 
+    @classmethod
+    def chosen_by(cls, config: TrainerConfig) -> Resumption | None:
+        """Read the checkpoint that nerfstudio's options for resuming name, or return None if they name none.
+
+        Raises InputError as `checkpoints.read_chosen`.
+        """
+        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
+        if chosen is None:
+            return None
+        path, state = chosen
+        return cls(path, state)
+
     @contextmanager
     def _errors_name_file(self) -> Iterator[None]:
+        """Raise InputError with the file's name instead of any error inside, except that of full memory."""
         try:
             yield
         except torch.cuda.OutOfMemoryError:
             raise
         except InputError as error:
-            message = f"{self.path} cannot be continued: {str(error).rstrip('.')}; {checkpoints.REMEDY}."
-            raise InputError(message) from error
+            problem = str(error).rstrip(".")
+            raise InputError(f"{self.path} cannot be continued: {problem}; {checkpoints.REMEDY}.") from error
         except Exception as error:  # A file of another program may raise anything.
             problem = f"{type(error).__name__}: {reason(error)}"
             raise InputError(
@@ -49,10 +63,15 @@ class Resumption:
 
     @property
     def plan(self) -> RunPlan | None:
-        """The plan of the run that wrote it; None if that was another method's, which `load_gaussians` refuses."""
+        """The plan of the run that wrote the checkpoint.
+
+        None if the checkpoint is of another method, which `load_gaussians` refuses.
+        """
         with self._errors_name_file():
             state = self.state["pipeline"].get("_extra_state")
-            return None if state is None else RunPlan.of(state["plan"])
+            if state is None:
+                return None
+            return RunPlan.of(state["plan"])
 
     def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
         """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
@@ -63,9 +82,12 @@ class Resumption:
             pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
             extra = self.state["pipeline"]["_extra_state"]
             check_same_capture(pipeline, extra["images"], extra["camera_positions"])
-            if more := sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys()):
-                remedy = "set pipeline.model.color-model and pipeline.model.camera-optimizer.mode as they were"
-                raise InputError(f"It optimized {' and '.join(more)}, too: {remedy}.")
+            others = sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys())
+            if others:
+                raise InputError(
+                    f"It optimized {' and '.join(others)}, too: set pipeline.model.color-model and "
+                    "pipeline.model.camera-optimizer.mode as they were."
+                )
 
     def load_optimizers(self, optimizers: Optimizers, schedulers: bool) -> None:
         """Load the optimizers and, if asked for, their schedulers, and print where the run goes on."""
@@ -77,13 +99,14 @@ class Resumption:
 
 
 def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
-    """Check that a checkpoint, with its images' names and cameras' centres [C, 3], is of the pipeline's data.
+    """Check that a checkpoint was trained on the pipeline's data, by its images' names and cameras' centres [C, 3].
 
     Images may have been added or removed if the others' poses stayed. Raises InputError if less than half of the
     cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
     """
     dataset = pipeline.datamanager.train_dataset
-    now, positions = [path.name for path in dataset.image_filenames], camera_positions(dataset.cameras)
+    now = [path.name for path in dataset.image_filenames]
+    positions = camera_positions(dataset.cameras)
     distances, _ = KDTree(positions).query(positions_before)  # [C]
     same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
     if 2 * same < min(len(before), len(now)):
@@ -92,7 +115,9 @@ def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions
             f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
             f"({now[0]}, …) does."
         )
-    if not {Path(name).stem for name in before} & {Path(name).stem for name in now}:
+    stems_before = {Path(name).stem for name in before}
+    stems_now = {Path(name).stem for name in now}
+    if stems_before.isdisjoint(stems_now):
         warn(
             "The checkpoint's run had the same cameras, but none of its images had the name of one of "
             f"these ({before[0]} and {now[0]} are the first): the Gaussians fit only if the images "

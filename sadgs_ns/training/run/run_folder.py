@@ -12,24 +12,32 @@ from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sadgs_ns.data.parsers import check_capture, keep_findings
+from sadgs_ns.data.checks.capture import check_ahead
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
+from sadgs_ns.training.options import drop_unknown
 from sadgs_ns.training.run import checkpoints, processes
+from sadgs_ns.training.run.progress import warn
 
 
 def begin(config: TrainerConfig) -> None:
-    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`."""
+    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`.
+
+    A warning names options of a loaded `config.yml` that this version does not have, and the new one leaves them out.
+    """
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():
         return
+    unknown = drop_unknown(config)
+    if unknown:
+        problem = "config.yml has options that this version of sadgs does not have"
+        warn(f"{problem}; they are ignored: {', '.join(unknown)}.")
     if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
         _check_address(config.viewer)
     data: Any = config.pipeline.datamanager
-    findings = check_capture(data)
+    check_ahead(data)
     CONSOLE.log(f"Saving config to: {write_config(config)}")
-    keep_findings(data, findings)  # After writing, so that `config.yml` holds none.
 
 
 def write_config(config: TrainerConfig) -> Path:
@@ -43,26 +51,36 @@ def write_config(config: TrainerConfig) -> Path:
 def _check_folder(config: TrainerConfig) -> None:
     """Raise InputError if the run would delete checkpoints of an earlier run in the same folder."""
     folder = config.get_checkpoint_dir()
-    there = sorted(folder.glob("step-*.ckpt")) if os.path.isdir(folder) else []
-    start = config.load_dir if config.load_checkpoint is None else config.load_checkpoint.parent
-    if there and (start is None or start.resolve() not in (folder.resolve(), folder.parent.resolve())):
-        raise InputError(
-            f"{folder} holds {there[-1].name} of an earlier run, which this run would delete: go on from it with "
-            f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
-        )
+    if not os.path.isdir(folder):
+        return
+    present = sorted(folder.glob("step-*.ckpt"))
+    if not present:
+        return
+    start = config.load_dir
+    if config.load_checkpoint is not None:
+        start = config.load_checkpoint.parent
+    if start is not None and start.resolve() in (folder.resolve(), folder.parent.resolve()):
+        return  # The run goes on from these checkpoints.
+    raise InputError(
+        f"{folder} holds {present[-1].name} of an earlier run, which this run would delete: go on from it with "
+        f"--load-dir {folder.parent} (load_dir in a config.yml), give another --timestamp, or remove it."
+    )
 
 
 def _check_address(viewer: ViewerConfig) -> None:
     """Raise InputError if the viewer cannot listen at its address; viser would take another port, or never return."""
-    host, port = viewer.websocket_host, viewer.websocket_port
+    port = viewer.websocket_port or 0
+    address = viewer.websocket_host
+    if port:
+        address = f"{address}:{port}"
     try:
-        places = socket.getaddrinfo(host, port or 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        for family, _, _, _, address in places:
-            socket.create_server(address, family=family).close()
+        found = socket.getaddrinfo(viewer.websocket_host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        for family, _, _, _, socket_address in found:
+            socket.create_server(socket_address, family=family).close()
     except OSError as error:
         problem = reason(error).partition(" (while")[0]
         raise InputError(
-            f"The viewer cannot listen on {host}{f':{port}' if port else ''} ({problem}): give another "
+            f"The viewer cannot listen on {address} ({problem}): give another "
             "viewer.websocket_port, or none for a free one, or another viewer.websocket_host: 127.0.0.1 opens the "
             "viewer to this machine only, 0.0.0.0 to the network."
         ) from error

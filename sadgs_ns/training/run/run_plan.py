@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
 from sadgs_ns.method.schedule import Schedule, between_one_and_four
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -33,7 +34,10 @@ class Rate:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """What was decided for a run, in `plan.yml` and its checkpoints; `SadgsModel.follow` replaces it."""
+    """What was decided for a run, in `plan.yml` and its checkpoints; `SadgsModel.follow` replaces it.
+
+    A field that is added here, to `Rate` or to the strategy needs a default: checkpoints of earlier versions lack it.
+    """
 
     iterations: int  # Length of the run in optimizer steps
     views_per_iteration: int  # Training views of a step; the loss is their mean
@@ -47,10 +51,19 @@ class RunPlan:
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> RunPlan:
-        """Make a plan of its `asdict`, which checkpoints hold."""
-        strategy = StructureAwareStrategy(**state["strategy"])
-        rates = {name: Rate(**rate) for name, rate in state["rates"].items()}
-        return cls(**{**state, "strategy": strategy, "rates": rates})
+        """Make a plan of its `asdict`, which checkpoints hold, as this version or another one wrote it.
+
+        Fields that this version does not have are left out (`unknown_fields`), and missing ones get their defaults.
+        Raise InputError if one that has no default is missing.
+        """
+        values = _known_values(cls, state, "")
+        strategy = _known_values(StructureAwareStrategy, state["strategy"], "strategy.")
+        values["strategy"] = StructureAwareStrategy(**strategy)
+        rates = {}
+        for name, rate in state["rates"].items():
+            rates[name] = Rate(**_known_values(Rate, rate, f"rates.{name}."))
+        values["rates"] = rates
+        return cls(**values)
 
     def write(self, folder: Path) -> None:
         """Write `plan.yml` into a run's folder. Raise WriteError if that is not possible."""
@@ -61,12 +74,44 @@ class RunPlan:
         """Return nerfstudio's configurations of optimizers and schedulers with the planned rates."""
         planned = {}
         for name, rate in self.rates.items():
-            group, decay = configs[name], asdict(rate)
+            group = configs[name]
+            decay = asdict(rate)
             optimizer = replace(group["optimizer"], lr=decay.pop("lr"))
-            ours = decay["max_steps"] is not None
-            scheduler = RunLengthDecaySchedulerConfig(**decay) if ours else group.get("scheduler")
+            scheduler = group.get("scheduler")
+            if rate.max_steps is not None:
+                scheduler = RunLengthDecaySchedulerConfig(**decay)
             planned[name] = {"optimizer": optimizer, "scheduler": scheduler}
         return planned
+
+
+def unknown_fields(state: Mapping[str, Any]) -> list[str]:
+    """Return the names of fields in a plan's `asdict` that this version does not have, such as "strategy.tau_split"."""
+    parts: list[tuple[str, type, Mapping[str, Any]]] = [
+        ("", RunPlan, state),
+        ("strategy.", StructureAwareStrategy, state["strategy"]),
+    ]
+    for rate in state["rates"].values():
+        parts.append(("rates.", Rate, rate))
+    names = []
+    for prefix, cls, values in parts:
+        known = {field.name for field in fields(cls)}
+        names += [prefix + name for name in values if name not in known]
+    return list(dict.fromkeys(names))  # All groups of rates have the same fields.
+
+
+def _known_values(cls: type, values: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Return the values of a dataclass's fields. Raise InputError if one is missing that has no default.
+
+    `prefix` is what the error puts before the field's name.
+    """
+    known = {}
+    for field in fields(cls):
+        if field.name in values:
+            known[field.name] = values[field.name]
+        elif field.default is MISSING and field.default_factory is MISSING:
+            problem = f"The checkpoint's plan has no {prefix}{field.name}"
+            raise InputError(f"{problem}: load it with the version of sadgs that wrote it.")
+    return known
 
 
 def plan_rates(
@@ -78,9 +123,14 @@ def plan_rates(
     """
     rates = {}
     for name, group in configs.items():
-        lr, decay = group["optimizer"].lr, group.get("scheduler")
-        factors = RATES_OF_FOUR_VIEWS.get(name, (1.0, 1.0)) if follow_views else (1.0, 1.0)
-        start, end = (between_one_and_four(length.views_per_iteration, factor) for factor in factors)
+        lr = group["optimizer"].lr
+        decay = group.get("scheduler")
+        start = 1.0
+        end = 1.0
+        if follow_views and name in RATES_OF_FOUR_VIEWS:
+            start_of_four, end_of_four = RATES_OF_FOUR_VIEWS[name]
+            start = between_one_and_four(length.views_per_iteration, start_of_four)
+            end = between_one_and_four(length.views_per_iteration, end_of_four)
         lr *= start
         if name == "means":
             lr *= extent
@@ -92,6 +142,8 @@ def plan_rates(
         final = decay.final_factor * (end / start)
         if follow_views and decay.hold_share > 0:
             final *= between_one_and_four(length.views_per_iteration, 1 / final)
-        steps = length.iterations if decay.max_steps is None else decay.max_steps
+        steps = decay.max_steps
+        if steps is None:
+            steps = length.iterations
         rates[name] = Rate(lr, decay.initial_factor, final, decay.hold_share, steps)
     return rates

@@ -20,7 +20,8 @@ and little else, for one to two seconds (docs/results.md#dense-start)."""
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
     """Return how many points of stereo depth a run may start from; print a line if CUDA is missing for them."""
-    model, views = pipeline.model, len(pipeline.datamanager.train_dataset)
+    model = pipeline.model
+    views = len(pipeline.datamanager.train_dataset)
     requested = model.config.stereo_points
     if model.seed_points is None or model.config.random_init:
         return 0
@@ -42,14 +43,17 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
     number = number_of_points(pipeline)
     if not number or resumed:
         return number > 0
-    model, cache = pipeline.model, pipeline.structure_cache
+    model = pipeline.model
+    cache = pipeline.structure_cache
     cached = pipeline.datamanager.cached_train  # Undistorting images changes cameras.
     # Frames of a video that lie far apart tell more about depth.
     chosen = torch.linspace(0, len(cached) - 1, min(len(cached), MOST_VIEWS)).round().long()
-    cameras, views = pipeline.datamanager.train_dataset.cameras[chosen], chosen.tolist()
+    cameras = pipeline.datamanager.train_dataset.cameras[chosen]
+    views = chosen.tolist()
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
     assert model.seed_points is not None
-    points, Ks = model.seed_points[0], cameras.get_intrinsics_matrices()
+    points = model.seed_points[0]
+    Ks = cameras.get_intrinsics_matrices()
     points = points[plausible_points(points)].to(model.device)
     # Images that stay compressed are decoded at each access: the host may have no room for all of them.
     masks = [d["mask"][..., 0].bool() if "mask" in d else None for d in (cached[view] for view in views)]

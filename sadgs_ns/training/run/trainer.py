@@ -19,24 +19,23 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sadgs_ns import events, interrupts
-from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError, WriteError, reason
-from sadgs_ns.interrupts import SIGNALS, Interrupted, Interrupts
+from sadgs_ns.interrupts import Interrupted, Interrupts
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.kernels_ahead import compile_ahead
 from sadgs_ns.training.kernels_ahead.compilation import compile_kernels
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints, processes
-from sadgs_ns.training.run.planning import one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.run.preparation import prepare_run
+from sadgs_ns.training.run.processes import Peers
 from sadgs_ns.training.run.progress import next_commands, note, remove_tables
 from sadgs_ns.training.run.resume import Resumption
 from sadgs_ns.training.run.run_folder import write_config
-from sadgs_ns.training.run.stereo_start import start_from_stereo
+from sadgs_ns.training.run.step_requests import StepRequests
 from sadgs_ns.training.step.cuda_graphs import GraphedSteps
 from sadgs_ns.training.step.optimizers import SadgsOptimizers
-from sadgs_ns.training.step.train_step import training_step
+from sadgs_ns.training.step.train_step import StepResult, ViewGroup, training_step
 
 _LESS_MEMORY = (
     "lower --pipeline.model.strategy.max-gaussians or --pipeline.views-per-iteration, or take smaller images "
@@ -56,27 +55,30 @@ class SadgsTrainer(Trainer):
     def __init__(self, config: SadgsTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         interrupts.redirect_on_broken_pipe(CONSOLE)
         config.check()
+        # Only fields of this copy itself are changed; all that they refer to is the caller's.
         config = copy.copy(config)  # Several processes agree on the time stamp, which `config.yml` must not hold.
         if config.machine.device_type == "cuda" and local_rank == 0:
             compile_ahead.begin()
         self.world, local_rank = processes.join(config, local_rank)
-        self._peers = None if self.world.alone else processes.Peers(self.world)
+        self._peers: Peers | None = None  # There are some if several processes train.
         if not self.world.alone:
+            self._peers = Peers(self.world)
             with processes.local_rank_zero_first(self.world, local_rank):
                 use_triton(self.world.device)  # This compiles a kernel.
-        config.pipeline.datamanager.train_cameras_sampling_seed = config.machine.seed
-        self._vis: Any = config.vis
+        self._requested_vis: Any = config.vis
         # nerfstudio would wrap the pipeline for several devices in its own way.
         super().__init__(config, local_rank, world_size=1)
-        self._stepping = False
-        self.graphed: GraphedSteps | None = None
-        self._resumed: Resumption | None = None
-        self._completed_step = self._saved_step = -1
-        self._save_due = math.inf
-        # While a run is paused or done, nerfstudio waits for the viewer's user, and nobody polls.
-        self._interrupts = Interrupts(
-            waiting=lambda: self.training_state != "training" and not self._stepping, started=not self.world.alone
-        )
+        self.graphed: GraphedSteps | None = None  # Replays steps as CUDA graphs, where that is possible.
+        self._resumed: Resumption | None = None  # The checkpoint to go on from, until its optimizers are loaded
+        self._stepping = False  # Whether a step has begun and is not done
+        self._completed_step = -1
+        self._saved_step = -1  # The last completed step that a checkpoint holds
+        self._save_due = math.inf  # When a checkpoint is due, by the monotonic clock in seconds
+        self._interrupts = Interrupts(waiting=self._waits_for_user, started=not self.world.alone)
+
+    def _waits_for_user(self) -> bool:
+        """Tell whether nerfstudio waits for the viewer's user, as it does while a run is paused or done."""
+        return self.training_state != "training" and not self._stepping
 
     def setup(self, *args: Any, **kwargs: Any) -> None:
         """Load data, model and checkpoint, and compile kernels, or raise InputError, RunError, SystemExit on SIGINT."""
@@ -86,15 +88,12 @@ class SadgsTrainer(Trainer):
             if processes.is_rank_zero():
                 plan.write(self.base_dir)
             events.report("training begins", iterations=plan.iterations)
-            last = [TrainingCallbackLocation.AFTER_TRAIN]
-            self.callbacks.append(TrainingCallback(last, lambda step: self._print_next_commands()))
+            after_run = [TrainingCallbackLocation.AFTER_TRAIN]
+            self.callbacks.append(TrainingCallback(after_run, lambda step: self._print_next_commands()))
             with processes.local_rank_zero_first(self.world, self.local_rank):
                 compile_kernels(self.pipeline, self.optimizers.optimizers)
-            model = self.pipeline.model
-            # In a graphed step the host must not wait, and cameras must not move.
-            known = self.world.alone and model.backend == "triton" and model.tile_forecast is not None
-            if self.config.cuda_graphs and known and model.camera_optimizer.config.mode == "off":
-                self.graphed = GraphedSteps(model)
+            if self._can_replay_steps():
+                self.graphed = GraphedSteps(self.pipeline.model)
         except RuntimeError as error:
             self._explain(error, "is too small to start", _LESS_MEMORY, _NOTHING_DONE)
             raise
@@ -102,19 +101,32 @@ class SadgsTrainer(Trainer):
             note(f"SIGINT: {_NOTHING_DONE}.")
             raise SystemExit(128 + signal.SIGINT) from None
 
+    def _can_replay_steps(self) -> bool:
+        """Tell whether steps of this run can be CUDA graphs: the host must not wait, and cameras must not move."""
+        model = self.pipeline.model
+        if not self.config.cuda_graphs or model.camera_optimizer.config.mode != "off":
+            return False
+        return self.world.alone and model.backend == "triton" and model.tile_forecast is not None
+
     def _explain(self, error: RuntimeError, full: str, remedy: str, kept: str) -> None:
-        """Raise RunError instead of an error of full memory, or one that another process had first."""
+        """Raise RunError instead of an error of full memory, or of one that another process caused by its end.
+
+        In its sentence, `full` says when the memory was full, `remedy` what to do, and `kept` what is saved.
+        """
         if isinstance(error, torch.cuda.OutOfMemoryError):
-            asked_for = ". ".join(reason(error).split(". ")[:2]).rstrip(".")  # Torch has many more sentences.
+            first_sentences = reason(error).split(". ")[:2]  # Torch has many more.
+            asked_for = ". ".join(first_sentences).rstrip(".")
             raise RunError(f"The GPU's memory {full} ({asked_for}): {remedy}.") from error
         if not isinstance(error, RunError) and self._peers is not None and self._peers.ended():
             raise RunError(f"Another process of the run ended, and this one with it: {kept}.") from error
 
     def _print_next_commands(self) -> None:
         """Print the commands for a finished run below nerfstudio's box, unless the run diverged."""
-        if not self.pipeline.diverged:
-            note(next_commands(self.base_dir / "config.yml", self.pipeline.model.num_gaussians))
-            events.report("training ends", gaussians=self.pipeline.model.num_gaussians)
+        if self.pipeline.diverged:
+            return
+        gaussians = self.pipeline.model.num_gaussians
+        note(next_commands(self.base_dir / "config.yml", gaussians))
+        events.report("training ends", gaussians=gaussians)
 
     def _load_checkpoint(self) -> None:
         """Load the checkpoint's optimizers; `setup_optimizers` has loaded its Gaussians."""
@@ -124,34 +136,14 @@ class SadgsTrainer(Trainer):
         self._resumed = None
 
     def setup_optimizers(self) -> SadgsOptimizers:
-        """Load the Gaussians of a checkpoint, if there is one, plan the run, and build its optimizers."""
-        config, pipeline = self.config, self.pipeline
-        chosen = checkpoints.read_chosen(config.load_dir, config.load_step, config.load_checkpoint)
-        self._resumed = resumed = None if chosen is None else Resumption(*chosen)
-        before = None if resumed is None else resumed.plan
-        dense = start_from_stereo(pipeline, resumed=resumed is not None)
-        cameras = pipeline.datamanager.train_dataset.cameras
-        if resumed is None:
-            pipeline.model.clear_paths(viewmats_from_camera_to_world(cameras.camera_to_worlds))
-        length = plan_length(config, len(cameras), before)
-        peers, views = None if config.share_always else self._peers, length.views_per_iteration
-        if peers is not None and peers.on_one_machine() and one_device_is_quicker(cameras, views, self.world.num_ranks):
-            processes.continue_on_rank_zero(self.world, peers)
-            self.world, self._peers = World(), None
-        if not self.world.alone:
-            if config.is_viewer_enabled() or config.is_viewer_legacy_enabled():
-                note("The viewer is off, since no device holds all Gaussians; `ns-viewer` shows the finished run.")
-                others = self._vis.removeprefix("viewer_legacy").removeprefix("viewer").removeprefix("+")
-                config.vis = others or "none"  # type: ignore[assignment]
-            pipeline.model.shard(self.world)
-        if resumed is not None:
-            resumed.load_gaussians(pipeline, self.world)
-            self._start_step = resumed.state["step"] + 1
-        pipeline.check_visibility()
-        plan = plan_run(config, pipeline, length, dense=dense, before=before, done=self._start_step)
-        pipeline.follow(plan)
-        config.max_num_iterations = plan.iterations  # nerfstudio's loop and table read it.
-        return SadgsOptimizers(plan.optimizers(config.optimizers), pipeline.get_param_groups())
+        """Prepare the run, as `prepare_run` says, and build its optimizers."""
+        run = prepare_run(self.config, self.pipeline, self.world, self._peers)
+        self.world = run.world
+        self._peers = run.peers
+        self._resumed = run.resumed
+        self._start_step = run.start_step
+        self.config.max_num_iterations = run.plan.iterations  # nerfstudio's loop and table read it.
+        return SadgsOptimizers(run.plan.optimizers(self.config.optimizers), self.pipeline.get_param_groups())
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in all; nerfstudio 1.1.5 would train that many more after resuming.
@@ -160,22 +152,26 @@ class SadgsTrainer(Trainer):
         WriteError if a checkpoint or log could not be written; SystemExit after a signal, once a checkpoint is saved.
         """
         total = self.pipeline.model.plan.iterations
-        self.step: int = max(self._start_step - 1, 0)  # names the checkpoint if nothing is left to do
-        self._completed_step = self._saved_step = self._start_step - 1
+        self.step: int = max(self._start_step - 1, 0)  # It names the checkpoint if nothing is left to do.
+        self._completed_step = self._start_step - 1
+        self._saved_step = self._start_step - 1
         self.config.max_num_iterations = max(total - self._start_step, 0)
         if self._start_step >= total:
             writer.GLOBAL_BUFFER["step"] = self.step  # Only an iteration would set it.
-            told = f"This run is finished after {self._start_step} iterations"
-            note(f"{told}: --max-num-iterations of more than {self._start_step} trains on.")
+            note(
+                f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
+                f"{self._start_step} trains on."
+            )
         self._set_clock(0.0)
         events.report("loop begins")
         try:
             self._train_until_interrupted(total)
         except InputError as error:  # An image that is decoded ahead of its step is gone or damaged.
-            raise InputError(f"{str(error).rstrip('.')}; {self._resume}.") from error
+            problem = str(error).rstrip(".")
+            raise InputError(f"{problem}; {self._how_to_resume}.") from error
         except RuntimeError as error:
             full = f"was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
-            self._explain(error, full, f"{_LESS_MEMORY}; {self._resume}", self._resume)
+            self._explain(error, full, f"{_LESS_MEMORY}; {self._how_to_resume}", self._how_to_resume)
             raise
         finally:
             self.config.max_num_iterations = total
@@ -202,8 +198,8 @@ class SadgsTrainer(Trainer):
                 raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
 
     @property
-    def _resume(self) -> str:
-        """What to tell the user after an error between two checkpoints."""
+    def _how_to_resume(self) -> str:
+        """The part of a sentence that says how the run goes on after an error between two checkpoints."""
         if not any(self.checkpoint_dir.glob("*.ckpt")):
             return "this run has made no checkpoint yet"
         return f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
@@ -211,38 +207,59 @@ class SadgsTrainer(Trainer):
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
         """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
         self._stepping = True
-        # Several processes agree in the step what to do after it. A signal has the bit of its number.
-        self.world.flags_in, signalled = 0, self._interrupts.received
-        bit = 0 if signalled is None else 1 << signalled
-        self.world.flags_out = int(time.monotonic() >= self._save_due) | bit
-        pipeline, model, graphed = self.pipeline, self.pipeline.model, self.graphed
-        if graphed is not None and model.tile_forecast is not None:
-            model.tile_forecast.round_to_powers = graphed.prepare(model.plan.views_per_iteration)
-        groups, update = pipeline.next_views(step), self.optimizers.update()
-        inputs = groups, model.opacity_reg_now, update
-        factors, slot = update.factors(), pipeline.log.slot
-        result = None if graphed is None else graphed.replay(*inputs, factors, slot)
-        if result is None:
-            result = training_step(model, *inputs, factors.to(update.device, non_blocking=True), slot)
-        pipeline.finish_step(step, groups, result)
+        # Several processes agree in the step what to do after it.
+        self.world.flags_in = 0
+        self.world.flags_out = self._own_requests().encode()
+        model = self.pipeline.model
+        if self.graphed is not None and model.tile_forecast is not None:
+            model.tile_forecast.round_to_powers = self.graphed.prepare(model.plan.views_per_iteration)
+        groups = self.pipeline.next_views(step)
+        result = self._train_on(groups)
+        self.pipeline.finish_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
         metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}
         model.camera_optimizer.get_metrics_dict(metrics)
         return result.loss, {"main_loss": result.loss}, metrics
 
+    def _train_on(self, groups: list[ViewGroup]) -> StepResult:
+        """Update all parameters by the loss of a step's views, with a CUDA graph if there is one for such a step."""
+        model = self.pipeline.model
+        opacity_reg = model.opacity_reg_now
+        update = self.optimizers.update()
+        factors = update.factors()
+        nonfinite_flag = self.pipeline.log.nonfinite_flag
+        if self.graphed is not None:
+            result = self.graphed.replay(groups, opacity_reg, update, factors, nonfinite_flag)
+            if result is not None:
+                return result
+        factors = factors.to(update.device, non_blocking=True)
+        return training_step(model, groups, opacity_reg, update, factors, nonfinite_flag)
+
+    def _own_requests(self) -> StepRequests:
+        """Return what this process asks of all."""
+        signals: tuple[int, ...] = ()
+        if self._interrupts.received is not None:
+            signals = (self._interrupts.received,)
+        return StepRequests(save=self._save_is_due(), signals=signals)
+
+    def _save_is_due(self) -> bool:
+        """Tell whether a checkpoint is due by this process's clock."""
+        return time.monotonic() >= self._save_due
+
     def _update_viewer_state(self, step: int) -> None:
         """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
-        self._completed_step, self._stepping = step, False
+        self._completed_step = step
+        self._stepping = False
         if self.world.alone:
             self._interrupts.poll()
-            due = time.monotonic() >= self._save_due
+            save_is_due = self._save_is_due()
         else:
-            due = bool(self.world.flags_in & 1)
-            for number in SIGNALS:
-                if self.world.flags_in >> number & 1:
-                    raise Interrupted(number)
+            requests = StepRequests.decode(self.world.flags_in)
+            if requests.signals:
+                raise Interrupted(requests.signals[0])
+            save_is_due = requests.save
         self._stop_if_diverged()
-        if due:
+        if save_is_due:
             self.save_checkpoint(step)
         super()._update_viewer_state(step)
 
@@ -263,9 +280,9 @@ class SadgsTrainer(Trainer):
 
     def _set_clock(self, took: float) -> None:
         """Set when the next checkpoint is due, after one that took `took` seconds to save."""
-        config = self.config
-        by_clock = config.steps_per_save == 0 and config.seconds_per_save > 0
-        wait = max(config.seconds_per_save, took / _SAVING_SHARE) if by_clock else math.inf
+        wait = math.inf
+        if self.config.steps_per_save == 0 and self.config.seconds_per_save > 0:
+            wait = max(self.config.seconds_per_save, took / _SAVING_SHARE)
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
@@ -278,13 +295,8 @@ class SadgsTrainer(Trainer):
         if done == self._start_step:
             text = f"{interrupted}: {_NOTHING_DONE}."
         else:
-            # With --load-config nerfstudio takes all options from this file.
-            config = copy.copy(self.config)
-            config.max_num_iterations = total
-            config.load_dir, config.load_step, config.load_checkpoint = self.checkpoint_dir, None, None
-            config.vis = self._vis
-            file = write_config(config) if processes.is_rank_zero() else self.base_dir / "config.yml"
-            command = shlex.join(["ns-train", str(config.method_name), "--load-config", str(file)])
+            file = self._write_config_to_resume(total)
+            command = shlex.join(["ns-train", str(self.config.method_name), "--load-config", str(file)])
             text = f"{interrupted}: stopped and saved after {done} of {total} iterations; resume with: {command}"
         if interrupted.number == signal.SIGHUP:  # Some systems take the terminal away later.
             interrupts.discard_broken_output()
@@ -292,16 +304,30 @@ class SadgsTrainer(Trainer):
         self.world.all(True)  # As soon as one process has ended, the others are ended.
         raise SystemExit(128 + interrupted.number)
 
+    def _write_config_to_resume(self, total: int) -> Path:
+        """Name the last checkpoint in `config.yml`, from which --load-config takes all options; return its path."""
+        config = copy.copy(self.config)
+        config.max_num_iterations = total
+        config.load_dir = self.checkpoint_dir
+        config.load_step = None
+        config.load_checkpoint = None
+        config.vis = self._requested_vis
+        if processes.is_rank_zero():
+            return write_config(config)
+        return self.base_dir / "config.yml"
+
     def _stop_if_diverged(self) -> None:
         """Save the Gaussians and raise RunError if the run has diverged."""
         if not self.pipeline.diverged:
             return
-        kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
-        finite = all(bool(parameter.isfinite().all()) for parameter in self.pipeline.model.gauss_params.values())
-        if self.world.all(finite):
+        parameters = self.pipeline.model.gauss_params.values()
+        are_finite = all(bool(parameter.isfinite().all()) for parameter in parameters)
+        if self.world.all(are_finite):
             if self._completed_step > self._saved_step:
                 self.save_checkpoint(self._completed_step)
             kept = f"the Gaussians as they are now are saved and go on with --load-dir {self.checkpoint_dir}"
+        else:
+            kept = "the Gaussians themselves are not finite: train anew, or from a checkpoint in which they are"
         remedy = "look at them with sadgs-doctor, and lower the learning rates if you raised them"
         raise RunError(f"{self.pipeline.diverged}; {remedy}; {kept}.")
 
@@ -311,8 +337,8 @@ class SadgsTrainer(Trainer):
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
-            "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
-            "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
+            "optimizers": {name: adam.state_dict() for name, adam in self.optimizers.optimizers.items()},
+            "schedulers": {name: rates.state_dict() for name, rates in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
         if not self.world.alone:

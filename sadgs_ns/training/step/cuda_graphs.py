@@ -104,8 +104,10 @@ class _Inputs:
         images = torch.stack([data["image"] for data in group.data])
         viewmats, Ks, *size = group.cameras
         cameras = Cameras(viewmats.clone(), Ks.clone(), *size)
-        numbers = None if group.view_ids is None else group.view_ids.clone()
-        copied = replace(group, cameras=cameras, view_ids=numbers, data=[{}] * len(images), images=images)
+        view_ids = group.view_ids
+        if view_ids is not None:
+            view_ids = view_ids.clone()
+        copied = replace(group, cameras=cameras, view_ids=view_ids, data=[{}] * len(images), images=images)
         return _Inputs(copied, factors.to(images.device))
 
     def write(self, group: ViewGroup, factors: Tensor) -> None:
@@ -153,15 +155,18 @@ class GraphedSteps:
         """Do `training_step` with `factors` on the host by a graph; return None if the step cannot be one."""
         from sadgs_ns.kernels.tiles import PairCounts
 
-        strategy, state = self._model.strategy, self._model.strategy_state
-        group, step = groups[0], self._model.step
+        strategy = self._model.strategy
+        state = self._model.strategy_state
+        group = groups[0]
+        step = self._model.step
         # Transparency and masks take more launches.
         plain = all("mask" not in data and data["image"].shape[-1] == 3 for data in group.data)
         known = group.options.tile_capacity is not None and (not group.options.absgrad or "grad2d" in state)
         observes = group.structure_tensors is not None
         if self.failure or len(groups) > 1 or not plain or not known or observes or strategy.densifies(step):
             return None
-        if (found := self._graph(group, opacity_reg, update, factors)) is None:
+        found = self._graph(group, opacity_reg, update, factors)
+        if found is None:
             return None
         replay, inputs = found
         inputs.write(group, factors)
@@ -207,15 +212,18 @@ class GraphedSteps:
         self.failure = reason(error)
         self._drop()
         self._recorder = None
-        told = f"A training step could not be captured as a CUDA graph ({self.failure})"
-        warn(f"{told}: the kernels of this run are launched one by one, which takes longer where Gaussians are few.")
+        warn(
+            f"A training step could not be captured as a CUDA graph ({self.failure}): the kernels of this run are "
+            "launched one by one, which takes longer where Gaussians are few."
+        )
 
 
 def _captured_step(model: SadgsModel, inputs: _Inputs, opacity_reg: float, update: AdamUpdate) -> Results:
     """Launch a training step, and keep what the host reads of it."""
     # The flag begins at 16 bytes, because Triton would compile Adam anew for a lesser alignment.
     values = torch.zeros(5, device=update.device)
-    result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, values[4:])
+    nonfinite_flag = values[4:]
+    result = training_step(model, [inputs.group], opacity_reg, update, inputs.factors, nonfinite_flag)
     # `copy_` copies memory; a kernel that no step has launched before would be loaded during the capture.
     values[0].copy_(result.loss)
     values[1].copy_(result.psnr)

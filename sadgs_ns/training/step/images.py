@@ -26,13 +26,18 @@ _Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32],
 
 def thread_count(requested: int | None) -> int:
     """Return the number of threads that decode images in this process; by default one per core, up to 16."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
     return requested or min(max(cores // processes_on_this_machine(), 1), 16)
 
 
 def stack(tensors: Sequence[Tensor]) -> Tensor:
     """Stack tensors as `torch.stack` does, but do not copy a single one."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
+    if len(tensors) == 1:
+        return tensors[0][None]
+    return torch.stack(list(tensors))
 
 
 def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: torch.device) -> Tensor | None:
@@ -66,17 +71,24 @@ class LazyImages(Sequence[dict[str, Any]]):
 
         Raises InputError if image or mask cannot be read, or has another size than its camera.
         """
-        name, size, undistort = self._names[index], tuple(self._sizes[index]), self._undistort[index]
+        name = self._names[index]
+        size = tuple(self._sizes[index])
+        undistort = self._undistort[index]
         try:
             data = self._dataset.get_data(index, image_type="uint8")
         except MemoryError:
             raise
         except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
-            masks = self._dataset._dataparser_outputs.mask_filenames is not None
-            problem = f"{name}{' or its mask' if masks else ''} cannot be read as an image ({reason(error)})"
-            raise InputError(f"{problem}: copy it again, or leave it out of the reconstruction.") from error
+            broken = name
+            if self._dataset._dataparser_outputs.mask_filenames is not None:
+                broken = f"{name} or its mask"
+            raise InputError(
+                f"{broken} cannot be read as an image ({reason(error)}): copy it again, or leave it out of the "
+                "reconstruction."
+            ) from error
         image: Tensor = data["image"]
-        if (width_and_height := (image.shape[1], image.shape[0])) != size:
+        width_and_height = (image.shape[1], image.shape[0])
+        if width_and_height != size:
             sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)
             raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
         if undistort is not None:
@@ -91,7 +103,8 @@ class LazyImages(Sequence[dict[str, Any]]):
 
         For 2 megapixels, Pillow blocks Python in other threads, such as the training loop, for 5 ms.
         """
-        content, image = self._names[image_idx].read_bytes(), None
+        content = self._names[image_idx].read_bytes()
+        image = None
         if self._opencv_agrees is not False and content[:2] == b"\xff\xd8" and content[-2:] == b"\xff\xd9":
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         if image is not None:
@@ -114,22 +127,27 @@ def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
     rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
     known: dict[bytes, tuple[_Undistort, NDArray[np.float32], NDArray[Any]]] = {}
     for index in distortion.any(dim=-1).nonzero().flatten().tolist():
-        if (row := rows[index].tobytes()) not in known:
+        row = rows[index].tobytes()
+        if row not in known:
             undistort = _undistort_as(cameras[index].reshape(()))
             # The new intrinsics do not depend on the pixels.
             empty = np.zeros((int(cameras.height[index]), int(cameras.width[index])), np.uint8)
             known[row] = undistort, *undistort({}, empty)[:2]
         undistorts[index], K, image = known[row]
-        cameras.fx[index], cameras.fy[index] = float(K[0, 0]), float(K[1, 1])
-        cameras.cx[index], cameras.cy[index] = float(K[0, 2]), float(K[1, 2])
-        cameras.width[index], cameras.height[index] = image.shape[1], image.shape[0]
+        cameras.fx[index] = float(K[0, 0])
+        cameras.fy[index] = float(K[1, 1])
+        cameras.cx[index] = float(K[0, 2])
+        cameras.cy[index] = float(K[1, 2])
+        cameras.width[index] = image.shape[1]
+        cameras.height[index] = image.shape[0]
     return undistorts
 
 
 def _undistort_as(camera: Cameras) -> _Undistort:
     """Return a function that undistorts images of a camera, without batch dimension, as it is now."""
     camera = copy.deepcopy(camera)
-    K, distortion = camera.get_intrinsics_matrices().numpy(), camera.distortion_params.numpy()  # type: ignore[union-attr]
+    K = camera.get_intrinsics_matrices().numpy()
+    distortion = camera.distortion_params.numpy()  # type: ignore[union-attr]
     return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
 
 
@@ -145,7 +163,9 @@ class ImagePrefetcher:
         self.threads = threads
         on_cuda = device.type == "cuda"
         self.decoded = isinstance(images, list) and all(not on_cuda or data["image"].is_pinned() for data in images)
-        self._stream = torch.cuda.Stream(device) if on_cuda else None
+        self._stream = None
+        if on_cuda:
+            self._stream = torch.cuda.Stream(device)
         self._pool: ThreadPoolExecutor | None = None
         self._loading: dict[int, Future[dict[str, Any]]] = {}
         self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}
@@ -177,7 +197,8 @@ class ImagePrefetcher:
 
     def close(self) -> None:
         """End the threads; they start again if another image is needed."""
-        pool, self._pool = self._pool, None
+        pool = self._pool
+        self._pool = None
         self._loading.clear()
         self._sent.clear()
         if pool is not None:
@@ -191,24 +212,38 @@ class ImagePrefetcher:
             if index in self._loading or index in self._sent:
                 continue
             if self._pool is None:
-                initializer: Any = (torch.cuda.set_device, (self.device,)) if self._stream is not None else ()
+                initializer: Any = ()
+                if self._stream is not None:
+                    initializer = (torch.cuda.set_device, (self.device,))
                 self._pool = ThreadPoolExecutor(self.threads, "images", *initializer)
             self._loading[index] = self._pool.submit(self._pinned, index)
 
     def _pinned(self, index: int) -> dict[str, Any]:
         """Return a view's data on the host, with CUDA in pinned memory; this runs in a thread."""
-        data, pin = dict(self.images[index]), self._stream is not None
-        return {name: v.pin_memory() if pin and isinstance(v, Tensor) else v for name, v in data.items()}
+        data = dict(self.images[index])
+        if self._stream is None:
+            return data
+        return _map_tensors(data, lambda tensor: tensor.pin_memory())
 
     def _copy(self, index: int) -> tuple[dict[str, Any], torch.cuda.Event | None]:
         """Return a view's data on the device, and with CUDA the event of their arrival."""
-        data = dict(self.images[index]) if self.decoded else self._loading.pop(index).result()
+        if self.decoded:
+            data = dict(self.images[index])
+        else:
+            data = self._loading.pop(index).result()
         if self._stream is None:
             return data, None
         with torch.cuda.stream(self._stream):
-            data = {
-                name: v.to(self.device, non_blocking=True) if isinstance(v, Tensor) else v for name, v in data.items()
-            }
+            data = _map_tensors(data, lambda tensor: tensor.to(self.device, non_blocking=True))
             copied = torch.cuda.Event()
             copied.record(self._stream)
         return data, copied
+
+
+def _map_tensors(data: Mapping[str, Any], function: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+    """Return a view's data with a function applied to its tensors; other values stay."""
+    mapped = dict(data)
+    for name, value in data.items():
+        if isinstance(value, Tensor):
+            mapped[name] = function(value)
+    return mapped

@@ -18,9 +18,11 @@ class NonFiniteLog:
         self._losses: list[Tensor] = []  # scalars on the device
         # The first column is NaN if a gradient was left out. Rows of 16 bytes keep Triton from compiling Adam anew.
         self._gradients = torch.zeros((capacity, 4), device=device)
-        self._slots = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
+        self._flags = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
         self._steps: list[tuple[int, list[int]]] = []
-        self.capacity, self.steps, self.streak = capacity, 0, 0
+        self.capacity = capacity
+        self.steps = 0
+        self.streak = 0
 
     @property
     def full(self) -> bool:
@@ -28,9 +30,9 @@ class NonFiniteLog:
         return len(self._steps) >= self.capacity
 
     @property
-    def slot(self) -> Tensor:
-        """The `nonfinite_flag` of the present step, which is not recorded yet. float32 [1]"""
-        return self._slots[len(self._steps)]
+    def nonfinite_flag(self) -> Tensor:
+        """The flag of the present step, which is not recorded yet; NaN if a gradient was not finite. float32 [1]"""
+        return self._flags[len(self._steps)]
 
     def record(self, step: int, views: list[int], loss: Tensor) -> None:
         """Add a step with its views and its loss, a scalar that must not change in place."""
@@ -42,7 +44,8 @@ class NonFiniteLog:
         if not self._steps:
             return []
         problems = []
-        losses, gradients = torch.stack(self._losses).tolist(), self._gradients[: len(self._steps), 0].tolist()
+        losses = torch.stack(self._losses).tolist()
+        gradients = self._gradients[: len(self._steps), 0].tolist()
         for (step, views), loss, gradient in zip(self._steps, losses, gradients, strict=True):
             if not math.isfinite(loss):
                 problem = f"the loss was {loss}"

@@ -26,8 +26,10 @@ class FusedAdam(Adam):
     """torch's fused Adam of one parameter, or its state that our kernel updates."""
 
     # Around these methods torch has others that import its compiler, which takes a second.
-    add_param_group, state_dict = unwrap(Adam.add_param_group), unwrap(Adam.state_dict)
-    load_state_dict, step = unwrap(Adam.load_state_dict), torch.no_grad()(unwrap(Adam.step))
+    add_param_group = unwrap(Adam.add_param_group)
+    state_dict = unwrap(Adam.state_dict)
+    load_state_dict = unwrap(Adam.load_state_dict)
+    step = torch.no_grad()(unwrap(Adam.step))
 
     def __init__(self, params: Iterable[Tensor], **options: Any) -> None:
         (parameter,) = params
@@ -58,7 +60,8 @@ class AdamUpdate:
         for state, parameter in zip(self._states, self.parameters.values(), strict=True):
             if self._triton and not state:
                 state["step"] = torch.tensor(0.0)
-                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+                state["exp_avg"] = torch.zeros_like(parameter)
+                state["exp_avg_sq"] = torch.zeros_like(parameter)
         self.exp_avgs, self.exp_avg_sqs = (
             tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
         )
@@ -98,7 +101,8 @@ class AdamUpdate:
 
         begin = 0
         for (_, betas, eps), names in self._launches:
-            part, begin = slice(begin, begin + len(names)), begin + len(names)
+            part = slice(begin, begin + len(names))
+            begin = begin + len(names)
             parameters = tuple(self.parameters[name] for name in names)
             in_order = tuple(gradients[name].contiguous() for name in names)
             adam_step(
@@ -157,8 +161,10 @@ class RunLengthDecayScheduler(Scheduler):
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
         """Make torch's scheduler, whose state torch's safe loader can load."""
-        max_steps, hold = self.config.max_steps, self.config.hold_share
-        initial, final = self.config.initial_factor, self.config.final_factor
+        max_steps = self.config.max_steps
+        hold = self.config.hold_share
+        initial = self.config.initial_factor
+        final = self.config.final_factor
         assert max_steps is not None, "the plan of the run sets it"
 
         def factor(step: int) -> float:

@@ -41,7 +41,8 @@ class RunningMean:
 
     def clear(self) -> None:
         """Forget what was added."""
-        self.count, self.means = 0, {}
+        self.count = 0
+        self.means = {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state for a checkpoint, without copying its tensors."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.distributed.bands import share_rows
+from sadgs_ns.distributed.world import World
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import empty_statistics, observe
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -27,12 +28,24 @@ class StructureCache:
 
     If decoded images are kept on the device, so is their S̄, all computed at once. If they are on the host, S̄ of a view
     is computed when a step first needs it, and kept there. If they stay compressed, S̄ is not kept: it would be larger.
-    `of_images` is `multiscale_structure_tensor` with the run's constant c in 1/px and its other `options`.
+
+    Attributes:
+        photo: Returns an image of the datamanager as the loss sees it: on the device and the background. [H, W, 3]
+        of_images: `multiscale_structure_tensor` with the run's constant c in 1/px and its other `options`.
     """
 
-    def __init__(self, views: TrainingViews, frequency_constant: float, **options: float | None) -> None:
+    def __init__(
+        self,
+        views: TrainingViews,
+        device: torch.device,
+        photo: Callable[[Mapping[str, Any]], Tensor],
+        frequency_constant: float,
+        **options: float | None,
+    ) -> None:
         self.views = views
+        self.photo = photo
         self.frequency_constant = frequency_constant
+        self._device = device
         self.of_images = partial(multiscale_structure_tensor, frequency_constant=frequency_constant, **options)  # type: ignore[arg-type]
         self.filled = False
         self._kept: dict[int, Tensor] = {}
@@ -54,16 +67,17 @@ class StructureCache:
         """Quantized S̄ of a training image, on the device. uint8 [H, W, 3]"""
         self.fill()
         if index in self._kept:
-            return self._kept[index].to(self.views.model.device, non_blocking=True)
+            return self._kept[index].to(self._device, non_blocking=True)
         return next(self.quantized([self.views.datamanager.cached_train[index]]))
 
-    def get(self, views: Sequence[tuple[int, Mapping[str, Any]]]) -> list[Tensor]:
+    def get(self, views: Sequence[tuple[int, Mapping[str, Any]]], world: World) -> list[Tensor]:
         """Return the quantized S̄ of a step's views of one size, in their order, on the device. uint8 [H, W, 3] each
 
-        All processes pass the same views; the one that composites a view's first rows computes its S̄.
+        All processes of the world pass the same views; the one that composites a view's first rows computes its S̄.
         """
         self.fill()
-        world, data, (height, width) = self.views.model.world, dict(views), self.views.sizes[views[0][0]]
+        data = dict(views)
+        height, width = self.views.sizes[views[0][0]]
         found = {index: self[index] for index in data if index in self._kept}
         bands = reversed(share_rows(len(views), height, world.num_ranks))
         ranks = {band.view: band.rank for band in bands}  # those of each view's first rows
@@ -84,22 +98,20 @@ class StructureCache:
         prefetcher = self.views.prefetcher
         if prefetcher is None or not prefetcher.decoded:
             return []
-        pinned = self.views.model.device.type == "cuda"
+        pinned = self._device.type == "cuda"
         return [torch.empty((*size, 3), dtype=torch.uint8, pin_memory=pinned) for size in self.views.sizes]
-
-    def photo(self, data: Mapping[str, Any]) -> Tensor:
-        """An image of the datamanager as the loss sees it: on the device, before the background. [H, W, 3]"""
-        model = self.views.model
-        return model.composite_with_background(model.get_gt_img(data["image"]), model.background)
 
     def quantized(self, data: Sequence[Mapping[str, Any]]) -> Iterator[Tensor]:
         """Yield quantized S̄ of the datamanager's images of one size, within their masks. uint8 [H, W, 3] each"""
-        at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1) if data else 1
+        at_once = 1
+        if data:
+            at_once = max(PIXELS_PER_BATCH // math.prod(data[0]["image"].shape[:2]), 1)
         for start in range(0, len(data), at_once):
             batch = data[start : start + at_once]
             images = torch.stack([self.photo(d) for d in batch])
             masks = stack_masks(batch, images.shape[1:3], images.device)
-            masks = None if masks is None else masks[..., 0]
+            if masks is not None:
+                masks = masks[..., 0]
             yield from quantize(self.of_images(images, masks, known_finite=True))
 
 
@@ -108,13 +120,15 @@ def observe_training_views(
     cache: StructureCache, progress: Callable[[range], Iterable[int]] = iter
 ) -> dict[str, Tensor]:
     """Observe η of the present Gaussians once in each training view; the run's random numbers do not change."""
-    views, model = cache.views, cache.views.model
+    views = cache.views
+    model = views.model
     model.set_crop(None)  # the viewer sets its crop box anew whenever it renders
     params = model.gauss_params
     generator = torch.Generator(model.device).manual_seed(0)
     statistics = empty_statistics(model.num_points, model.device)
     for index in progress(range(len(views))):
-        tensors, (viewmats, Ks) = cache[index][None], views.stacked_cameras([index])
+        tensors = cache[index][None]
+        viewmats, Ks = views.stacked_cameras([index])
         cameras = Cameras(viewmats, Ks, tensors.shape[2], tensors.shape[1])
         _, _, info = model.render(cameras, model.color_options())
         info |= {"viewmats": viewmats, "Ks": Ks, "structure_tensors": tensors}

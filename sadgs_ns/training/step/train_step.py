@@ -17,7 +17,7 @@ from torch import Tensor
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.method.losses import photometric_loss, photometric_part
-from sadgs_ns.render.types import Cameras, RenderOptions
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 from sadgs_ns.training.step.images import stack, stack_masks
@@ -41,7 +41,8 @@ class ViewGroup:
     def batch(self, band: Band | None) -> dict[str, Tensor]:
         """Return `image` and, if a view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
         if band is not None:
-            rows, data = slice(band.top, band.bottom), self.data[band.view]
+            rows = slice(band.top, band.bottom)
+            data = self.data[band.view]
             return {name: data[name][None, rows] for name in ("image", "mask") if name in data}
         batch = {"image": stack([data["image"] for data in self.data]) if self.images is None else self.images}
         masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
@@ -71,56 +72,31 @@ def training_step(
     It waits for none of it; only several processes wait for the numbers of Gaussians that they send each other. If the
     tile lists of a group were too short, it was not drawn and gives no gradient. If all were, nothing changes.
     """
-    strategy, state, world, step = model.strategy, model.strategy_state, model.strategy.world, model.step
+    world = model.strategy.world
     # Gradients of the parameters themselves would add up on the stream of their first use, where no graph is captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
     for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
         update.parameters[name].grad = None
-    share = 1.0 if world.alone else len(leaves["means"]) / world.total
-    gaussians, penalty = model.gaussians(leaves, opacity_reg * share)
-    num_views, background = sum(len(group.indices) for group in groups), model.background
-    losses: list[Tensor] = []
-    qualities: list[Tensor] = []  # PSNR of groups; with several processes, mean square errors of bands
-    infos: list[dict[str, Any]] = []
-    # All processes have the same groups, and autograd goes back through them in the same order.
-    for group in groups:
-        pictures, info = rasterize(world, gaussians, group.cameras, group.options)
-        viewmats, Ks = group.cameras[:2]
-        info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
-        strategy.step_pre_backward(model.gauss_params, {}, state, step, info)
-        infos.append(info)
-        for band, colors, alphas in pictures:
-            if group.view_ids is not None:
-                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
-            rgb = model.before_background(colors, alphas, background)
-            predicted, target = model.masked_pair(rgb, group.batch(band), background)
-            if band is None:
-                # The kernel adds the penalty to the loss of a single group.
-                parts, penalty = (penalty, None) if len(groups) == 1 else (None, penalty)
-                loss, quality = photometric_loss(predicted, target, ssim_lambda=model.config.ssim_lambda, parts=parts)
-                weight = len(group.indices) / num_views
-            else:
-                loss, quality = photometric_part(
-                    predicted, target, rows=(band.first, band.last), top=band.top, height=group.cameras.height,
-                    ssim_lambda=model.config.ssim_lambda,
-                )  # fmt: skip
-                weight = 1 / num_views
-            losses.append(loss if weight == 1 else weight * loss)
-            qualities.append(quality if weight == 1 else weight * quality)
-        if (anchor := info.pop("anchor", None)) is not None:
-            losses.append(anchor)
-    if penalty is not None:
-        losses.append(penalty.sum())
+    if not world.alone:
+        opacity_reg *= len(leaves["means"]) / world.total  # The mean is over the Gaussians of all processes.
+    gaussians, penalty = model.gaussians(leaves, opacity_reg)
+    if world.alone and len(groups) == 1:
+        # The kernel adds the penalty to the loss of a single group.
+        losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, penalty)
+    else:
+        losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, None)
+        if penalty is not None:
+            losses.append(penalty.sum())
     pose_penalties: dict[str, Tensor] = {}
     model.camera_optimizer.get_loss_dict(pose_penalties)
     losses += pose_penalties.values()
     loss = reduce(torch.add, losses)
     loss.backward()
     learned = {name: leaves.get(name, parameter) for name, parameter in update.parameters.items()}
-    gradients = {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in learned.items()}
+    gradients = {name: _gradient_of(leaf) for name, leaf in learned.items()}
     overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
     update.launch(gradients, factors, nonfinite_flag, overflowed)
-    strategy.accumulate(state, step, infos)
+    model.strategy.accumulate(model.strategy_state, model.step, infos)
     loss = loss.detach()
     if world.alone:
         psnr = reduce(torch.add, qualities)
@@ -128,3 +104,78 @@ def training_step(
         loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))
         psnr = -10 * error.log10()
     return StepResult(loss, psnr, gradients["means"], infos)
+
+
+def _render_and_compare(
+    model: SadgsModel,
+    groups: Sequence[ViewGroup],
+    gaussians: Gaussians,
+    leaves: Mapping[str, Tensor],  # The parameters by name, of which the Gaussians were made
+    penalty: Tensor | None,  # Numbers whose sum is added to the loss of a single group
+) -> tuple[list[Tensor], list[Tensor], list[dict[str, Any]]]:
+    """Render the views of a step and compare them with their photos.
+
+    Returns:
+        Losses, whose sum is that of the step. Qualities, whose sum is the mean PSNR in dB; with several processes, the
+        mean square error. The rasterizer's info of each group, in which η was observed if that is due.
+    """
+    world = model.strategy.world
+    num_views = sum(len(group.indices) for group in groups)
+    losses: list[Tensor] = []
+    qualities: list[Tensor] = []
+    infos: list[dict[str, Any]] = []
+    # All processes have the same groups, and autograd goes back through them in the same order.
+    for group in groups:
+        pictures, info = rasterize(world, gaussians, group.cameras, group.options)
+        viewmats, Ks = group.cameras[:2]
+        info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
+        model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
+        infos.append(info)
+        for band, colors, alphas in pictures:
+            if group.view_ids is not None:
+                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
+            rgb = model.before_background(colors, alphas, model.background)
+            pair = model.masked_pair(rgb, group.batch(band), model.background)
+            loss, quality, views = _compare(pair, group, band, model.config.ssim_lambda, penalty)
+            if views != num_views:
+                loss = views / num_views * loss
+                quality = views / num_views * quality
+            losses.append(loss)
+            qualities.append(quality)
+        anchor = info.pop("anchor", None)
+        if anchor is not None:
+            losses.append(anchor)
+    return losses, qualities, infos
+
+
+def _compare(
+    pair: tuple[Tensor, Tensor],  # A rendering and its photo [V, H, W, 3], of a band its rows alone
+    group: ViewGroup,
+    band: Band | None,
+    ssim_lambda: float,
+    penalty: Tensor | None,  # Numbers whose sum is added to the loss of a whole group
+) -> tuple[Tensor, Tensor, int]:
+    """Return the loss of a group or of one view's band, its quality, and the number of views that both are of.
+
+    The quality is PSNR in dB of a group, and the mean square error of a band.
+    """
+    predicted, target = pair
+    if band is None:
+        loss, quality = photometric_loss(predicted, target, ssim_lambda=ssim_lambda, parts=penalty)
+        return loss, quality, len(group.indices)
+    loss, quality = photometric_part(
+        predicted,
+        target,
+        rows=(band.first, band.last),
+        top=band.top,
+        height=group.cameras.height,
+        ssim_lambda=ssim_lambda,
+    )
+    return loss, quality, 1
+
+
+def _gradient_of(leaf: Tensor) -> Tensor:
+    """Return the gradient of a tensor, zeros if it has none."""
+    if leaf.grad is None:
+        return torch.zeros_like(leaf)
+    return leaf.grad

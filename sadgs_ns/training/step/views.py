@@ -80,6 +80,10 @@ class TrainingViews:
         self.model = model
         self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
 
+    def seed(self, seed: int) -> None:
+        """Begin anew with rounds of views in an order that this seed decides."""
+        self.sampler = ViewSampler(len(self), seed)
+
     def __len__(self) -> int:
         """Number of training views."""
         return self.sampler.num_views
@@ -106,12 +110,15 @@ class TrainingViews:
         The image is on the training device, and so is the mask if it was prefetched. With several processes, prefetched
         data is there only of views that this process composites. Raises as `ImagePrefetcher.take`.
         """
-        indices, prefetcher = self.sampler.draw(number), self.prefetcher
+        indices = self.sampler.draw(number)
+        prefetcher = self.prefetcher
         if prefetcher is None:
-            cached, device = self.datamanager.cached_train, self.model.device
+            cached = self.datamanager.cached_train
+            device = self.model.device
             return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
         data = prefetcher.take(self._composited(indices))
-        share, threads = math.ceil(number / self.model.world.num_ranks), prefetcher.threads
+        share = math.ceil(number / self.model.world.num_ranks)
+        threads = prefetcher.threads
         steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
         # The number of views under way is the same in each step, so that none is forgotten before its step.
         most = max(threads + 2 * share, len(steps[0]))
@@ -139,7 +146,8 @@ class TrainingViews:
         """
         dataset = self.datamanager.train_dataset
         _ = self.datamanager.cached_train  # Undistorting the images has changed the intrinsics.
-        cameras, device = dataset.cameras, self.model.device
+        cameras = dataset.cameras
+        device = self.model.device
         check_undistortion(cameras, dataset.image_filenames)
         viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
         return viewmats.to(device).unbind(), cameras.get_intrinsics_matrices().to(device).unbind()
@@ -157,7 +165,8 @@ class TrainingViews:
     def stacked_cameras(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
         """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
         _, every_K = self.cameras
-        viewmats, Ks = [self.viewmat(index) for index in indices], [every_K[index] for index in indices]
+        viewmats = [self.viewmat(index) for index in indices]
+        Ks = [every_K[index] for index in indices]
         n = len(indices)
         if n == 1:
             return viewmats[0][None], Ks[0][None]

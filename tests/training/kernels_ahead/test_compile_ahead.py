@@ -20,7 +20,7 @@ os.dup2(os.pipe()[0], 0)  # the run's end of which stays open
 import torch, triton
 from triton.backends.compiler import GPUTarget
 from triton.backends.nvidia.driver import CudaDriver
-from sadgs_ns.training import compile_ahead
+from sadgs_ns.training.kernels_ahead import compile_ahead
 
 class IdleDriver(CudaDriver):  # It drives an H100 that does nothing.
     def __init__(self): self.utils = self
@@ -117,7 +117,7 @@ def test_where_a_kernel_does_not_compile_the_next_run_tries_again(tmp_path: Path
 
 SLOW = """
 import os, sys, time
-from sadgs_ns.training import compile_ahead
+from sadgs_ns.training.kernels_ahead import compile_ahead
 
 def compile_kernel(index):
     os.write(2, b"x")

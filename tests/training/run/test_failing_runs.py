@@ -26,8 +26,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 
-from helpers.kill_and_resume import differences, parser_of
-from helpers.short_runs import checkpoint, configure, is_finite, set_up, train
+from helpers.kill_and_resume import differences, parser_of, set_up
+from helpers.short_runs import checkpoint, configure, is_finite, train
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
@@ -196,10 +196,10 @@ def test_cameras_that_see_nothing_are_refused(config: SadgsTrainerConfig):
 
 
 def test_a_scene_in_tiny_units_is_seen_since_its_near_plane_is_in_them(config: SadgsTrainerConfig):
-    plane = set_up(config).pipeline.model.near_plane
+    plane = set_up(config).pipeline.model.plan.near_plane
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e-4)
-    assert set_up(config).pipeline.model.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
+    assert set_up(config).pipeline.model.plan.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
 
 
 @pytest.mark.hard_case(

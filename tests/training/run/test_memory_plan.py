@@ -2,10 +2,10 @@
 
 The memory that the driver has left and that torch's allocator keeps unused must hold the new Gaussians (parameter,
 gradient, two moments, statistics), a copy of the widest parameter while it is rewritten, and the working memory of the
-next step, which is the largest of three phases: tile lists, loss, backward pass. `method/memory.py` counts it for the
-views, pixels and tile pairs of a step: 162 bytes for each pixel in the loss (300 without our kernels), and altogether
-about 1.8 kB a Gaussian of degree 3 at one view a step, 2.3 kB at two and 3.5 kB at four, if each has 12 pairs in a
-view. Fragmentation of the allocator's unused memory is not counted.
+next step, which is the largest of three phases: tile lists, loss, backward pass. `render/step_memory.py` counts it for
+the views, pixels and tile pairs of a step: 162 bytes for each pixel in the loss (300 without our kernels), and
+altogether about 1.8 kB a Gaussian of degree 3 at one view a step, 2.3 kB at two and 3.5 kB at four, if each has 12
+pairs in a view. Fragmentation of the allocator's unused memory is not counted.
 
 On an H200, with all but 6 or 3 GB taken by another process, a run that would take 8.6 GB warned at each step that it
 reduced, went on and ended with a checkpoint; with 1.2 GB it ended at iteration 0 with one sentence.
@@ -28,11 +28,13 @@ from helpers.kill_and_resume import configure, set_up
 from sadgs_ns import host_memory
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import triton_switched
-from sadgs_ns.method import memory
-from sadgs_ns.method import strategy as strategy_module
-from sadgs_ns.method.memory import StepSize
-from sadgs_ns.method.strategy import StructureAwareStrategy, empty_state
+from sadgs_ns.method import running_strategy as strategy_module
+from sadgs_ns.method.running_strategy import empty_state
+from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.render import step_memory
+from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.training.run.memory_plan import (
+    ImageStorage,
     TrainingSize,
     choose_image_storage,
     fit_to_memory,
@@ -58,8 +60,8 @@ def each(views: int = 1) -> float:
     """Bytes of one more Gaussian: what it keeps, its widest parameter once more, and the larger of what it takes while
     tile lists are sorted and in the backward pass.
     """
-    lists = 16 + views * (52 + 40) + memory.PAIRS_PER_GAUSSIAN * views * 40
-    backward = 16 + 28 + views * (52 + 84) + memory.PAIRS_PER_GAUSSIAN * views * 4
+    lists = 16 + views * (52 + 40) + step_memory.PAIRS_PER_GAUSSIAN * views * 40
+    backward = 16 + 28 + views * (52 + 84) + step_memory.PAIRS_PER_GAUSSIAN * views * 4
     return KEPT + WIDEST + max(lists, backward)
 
 
@@ -68,7 +70,7 @@ def card(monkeypatch: pytest.MonkeyPatch):
     """Sets a card's free and total memory in GB."""
 
     def set_memory(free: float, total: float) -> None:
-        monkeypatch.setattr(memory, "available_bytes", lambda device: (1e9 * free, 1e9 * total))
+        monkeypatch.setattr(step_memory, "available_bytes", lambda device: (1e9 * free, 1e9 * total))
 
     return set_memory
 
@@ -91,17 +93,17 @@ def test_what_a_gaussian_takes_is_what_a_split_asks_for():
     size = StepSize(views=2, pixels=1000, pairs=5000)
     lists = 10 * (16 + 2 * 92 + WIDEST) + 5000 * 40
     state = empty_state(0, torch.device("cpu"))
-    assert memory.kept_bytes(params(), state) == KEPT  # type: ignore[arg-type]
+    assert step_memory.kept_bytes(params(), state) == KEPT  # type: ignore[arg-type]
     for grown in (0, 1, 7):
         free = lists + grown * each(2)
         with triton_switched(True):
-            found = [memory.affordable_growth(params(), state, room, size) for room in (free, free - 1)]  # type: ignore[arg-type]
+            found = [step_memory.affordable_growth(params(), state, room, size) for room in (free, free - 1)]  # type: ignore[arg-type]
         assert found == [grown, max(grown - 1, 0)]
 
 
 def test_each_phase_counts_what_it_grows_with():
     def peak(n: int = 1000, views: int = 1, pixels: int = 10**6, pairs: int = 10**5) -> dict[str, float]:
-        return memory.step_bytes(n, StepSize(views, pixels, pairs), torch.device("cpu"))
+        return step_memory.step_bytes(n, StepSize(views, pixels, pairs), torch.device("cpu"))
 
     assert all(peak(n=2000)[name] > value for name, value in peak().items())
     assert all(peak(views=4)[name] > value for name, value in peak().items())
@@ -188,7 +190,7 @@ def test_what_is_free_counts_what_this_process_holds_as_its_own(monkeypatch: pyt
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 30)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 10)
     device = torch.device("cuda")
-    assert memory.available_bytes(device) == (80, 100) and memory.free_bytes(device) == 70
+    assert step_memory.available_bytes(device) == (80, 100) and step_memory.free_bytes(device) == 70
 
 
 # --- the size of a run ---
@@ -240,17 +242,17 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     images = VIEWS * WIDTH * HEIGHT * 3 + 8 * WIDTH * HEIGHT * 3
     unbounded = copy.deepcopy(config)
     loss = 300 * WIDTH * HEIGHT  # in torch, since the device is the CPU; no phase takes more for so few Gaussians
-    card((images + loss + 120.5 * (KEPT + WIDEST + 16 + 52 + memory.PAIRS_PER_GAUSSIAN * 4)) / 0.8e9, 8)
+    card((images + loss + 120.5 * (KEPT + WIDEST + 16 + 52 + step_memory.PAIRS_PER_GAUSSIAN * 4)) / 0.8e9, 8)
     trainer = set_up(config)
     model = trainer.pipeline.model
     assert model.num_points < 120
     assert "At most 120 Gaussians: 0.0 GB of the card's 8.0 GB; " in capsys.readouterr().out
     trainer.train()
-    assert model.num_points == model.strategy.max_gaussians == 120
+    assert model.num_points == model.plan.strategy.max_gaussians == 120
     assert config.pipeline.model.strategy.max_gaussians == DEFAULT, "config.yml tells what was asked for"
     card(139, 140)
     trainer = set_up(unbounded)
-    assert trainer.pipeline.model.strategy.max_gaussians == DEFAULT
+    assert trainer.pipeline.model.plan.strategy.max_gaussians == DEFAULT
 
 
 def test_a_budget_for_nothing_ends_ns_train_with_one_sentence(card: Any, tmp_path: Path):
@@ -279,26 +281,24 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1e15)
 
     card(1.01 * size / share / 1e9, 80)
-    assert choose_image_storage(small, gpu) is None
-    assert small.config.cache_images == "gpu"
+    assert choose_image_storage(small, gpu) == ImageStorage("gpu")
     card(0.99 * size / share / 1e9, 80)
-    assert (choose_image_storage(small, gpu) or "").startswith(
+    storage = choose_image_storage(small, gpu)
+    assert storage.where == "cpu" and small.config.cache_images == "gpu", "the caller applies it"
+    assert storage.sentence.startswith(
         "The images stay in the host's memory and are copied ahead of the steps: decoded images and their structure "
         f"take {size / 1e9:.2g} GB, and the GPU has 0."
     )
-    assert small.config.cache_images == "cpu"
 
     card(80, 80)
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
-        line = choose_image_storage(large, device) or ""
-        assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded images and ")
-        assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in line
-        assert large.config.cache_images == "compressed"
+        storage = choose_image_storage(large, device)
+        compressed = "The images stay compressed and are decoded ahead of the steps: decoded images and "
+        assert storage.where == "compressed" and storage.sentence.startswith(compressed)
+        assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in storage.sentence
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
-    large.config.cache_images = "gpu"
-    assert choose_image_storage(large, torch.device("cpu")) is None
-    assert large.config.cache_images == "gpu"  # the training device
+    assert choose_image_storage(large, torch.device("cpu")) == ImageStorage("gpu")  # the training device
 
 
 @pytest.mark.parametrize(

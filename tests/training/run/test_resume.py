@@ -74,7 +74,8 @@ def one_line(text: str, start: str) -> str:
 
 def kill_and_resume(*arguments: object) -> str:
     """Run the script and return its output."""
-    script = f"import sys, kill_and_resume; sys.exit(kill_and_resume.main({[str(word) for word in arguments]}))"
+    words = [str(word) for word in arguments]
+    script = f"import sys; from helpers import kill_and_resume; sys.exit(kill_and_resume.main({words}))"
     result = forked_python.python(script, timeout=1800)
     assert result.returncode == 0, result.stdout + result.stderr
     return result.stdout
@@ -772,14 +773,14 @@ def test_a_resumption_keeps_the_cap_where_memory_has_room_for_it(
     plan(500)
     trainer = set_up(config)
     trainer.save_checkpoint(1)
-    assert trainer.pipeline.model.strategy.max_gaussians == 500
+    assert trainer.pipeline.model.plan.strategy.max_gaussians == 500
     plan(now)
     config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
     config.pipeline.model.strategy.max_gaussians = asked
     capsys.readouterr()
     resumed = set_up(config)
     printed = capsys.readouterr().out
-    assert resumed.pipeline.model.strategy.max_gaussians == cap
+    assert resumed.pipeline.model.plan.strategy.max_gaussians == cap
     assert resumed.pipeline.structure.set_max_gaussians.value == cap
     assert said in printed and (said or "checkpoint's run" not in printed)
 

@@ -74,7 +74,7 @@ def test_a_run_is_planned_once_and_its_options_stay_as_they_were_asked_for(confi
     given = config.pipeline.model.strategy
     assert plan.strategy.clone_grad2d == pytest.approx(0.8 * given.clone_grad2d)
     assert (plan.iterations, plan.devices, plan.images) == (ITERATIONS, 1, "gpu")
-    assert None not in vars(plan.strategy).values() and plan.near_plane == model.near_plane
+    assert None not in vars(plan.strategy).values() and plan.near_plane == model.drawing.near_plane
     assert plan.rates.keys() == trainer.optimizers.optimizers.keys()
     for name, optimizer in trainer.optimizers.optimizers.items():
         assert optimizer.param_groups[0]["initial_lr" if plan.rates[name].max_steps else "lr"] == plan.rates[name].lr
@@ -91,7 +91,7 @@ def test_the_plan_is_written_beside_config_yml_and_kept_in_the_checkpoint(config
     assert written == kept == dataclasses.asdict(plan_of(trainer))
     assert RunPlan.of(kept) == plan_of(trainer)
     _, drawing = export.read_checkpoint(file)
-    assert drawing == RenderOptions(near_plane=trainer.pipeline.model.near_plane, max_off_axis=2.5)
+    assert drawing == RenderOptions(near_plane=plan_of(trainer).near_plane, max_off_axis=2.5)
     assert [path.name for path in trainer.base_dir.iterdir() if ".partial" in path.name] == []
 
 
@@ -107,7 +107,8 @@ def test_whoever_loads_a_run_has_its_plan_and_a_resumed_run_makes_one_of_its_own
     loaded = config.pipeline.setup(device="cpu", test_mode="test")
     state = torch.load(file, weights_only=True)
     loaded.load_pipeline(state["pipeline"], state["step"])
-    assert loaded.model.plan == model.plan and loaded.model.strategy == strategy
+    assert loaded.model.plan == model.plan
+    assert loaded.model.strategy == strategy.for_run(ITERATIONS)
     assert (loaded.structure.set_max_gaussians.value, loaded.structure.set_tau_split.value) == (777, 0.25)
 
     config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"

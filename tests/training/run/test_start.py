@@ -16,7 +16,7 @@ import torch
 from helpers import forked_python
 from helpers.kill_and_resume import differences
 from helpers.small_scenes import VIEWS
-from sadgs_ns.training.run.deferred_imports import DEFERRED
+from sadgs_ns.training.run.deferred_imports import DEFERRED, TorchForCameras
 
 UNUSED = (
     "nerfstudio.configs.method_configs", "nerfstudio.viewer.viewer", "nerfstudio.scripts.train", "torch._dynamo",
@@ -37,15 +37,18 @@ left = [name for name, module in sys.modules.items() if type(module) is StandIn]
 from nerfstudio.model_components import lib_bilagrid
 from nerfstudio.models import splatfacto
 from nerfstudio.pipelines import base_pipeline
-from nerfstudio.utils import writer
+from nerfstudio.utils import tensor_dataclass, writer
 import torch, torchvision, viser
 from torch.utils.tensorboard import SummaryWriter
+of_cameras = tensor_dataclass.torch.broadcast_shapes
 resolved = [
     base_pipeline.vutils.save_image is torchvision.utils.save_image,
     type(writer.SummaryWriter(log_dir="logs")) is SummaryWriter,
     splatfacto.color_correct.__call__(torch.ones(2, 2, 3), torch.ones(2, 2, 3)).shape == (2, 2, 3),
     sys.modules["nerfstudio.engine.trainer"].viser.ViserServer is viser.ViserServer,
-    torch.broadcast_shapes((2, 1), 3) == (2, 3) == torch.broadcast_shapes(torch.Size([2, 3])),
+    of_cameras((2, 1), 3) == (2, 3) == of_cameras(torch.Size([2, 3])),
+    of_cameras is not torch.broadcast_shapes and torch.broadcast_shapes.__module__ == "torch.functional",
+    tensor_dataclass.torch.Tensor is torch.Tensor,
 ]
 import nerfstudio.scripts.train  # as for several GPUs
 print(json.dumps({{"held": held, "unused": unused, "left": left, "resolved": resolved}}))
@@ -96,4 +99,14 @@ def test_stand_ins_lie_only_where_nerfstudio_asked_for_them(runs: tuple[Path, Pa
 
 
 def test_a_stand_in_is_the_true_thing_for_who_asks(runs: tuple[Path, Path, dict[str, Any]]):
-    assert runs[2]["resolved"] == [True] * 5
+    assert runs[2]["resolved"] == [True] * 7
+
+
+def test_shapes_of_cameras_that_do_not_fit_are_refused_as_by_torch():
+    shapes = TorchForCameras("torch").broadcast_shapes
+    for wrong in [((2, 3), (4,)), ((2,), "3")]:
+        with pytest.raises(RuntimeError) as ours:
+            shapes(*wrong)
+        with pytest.raises(RuntimeError) as theirs:
+            torch.broadcast_shapes(*wrong)
+        assert str(ours.value) == str(theirs.value)

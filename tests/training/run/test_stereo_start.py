@@ -17,7 +17,7 @@ from examples.drawn_scene.scene import room_surfaces
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import TRAIN_VIEWS, configure, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, POINTS, WIDTH
-from sadgs_ns.data.parsers import points_in_the_run
+from sadgs_ns.data.run_frame import points_in_the_run
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world

@@ -87,7 +87,7 @@ class Training:
             if self.way == "apart":
                 updates = [AdamUpdate({name: optimizer}) for name, optimizer in adams.items()]
             for update in updates:
-                update.launch(gradients, update.factors().to(DEVICE), self.log.slot)
+                update.launch(gradients, update.factors().to(DEVICE), self.log.nonfinite_flag)
         self.log.record(step, [0], torch.zeros((), device=DEVICE))
         self.optimizers.scheduler_step_all(step)
 

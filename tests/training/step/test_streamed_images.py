@@ -21,7 +21,7 @@ from sadgs_ns import host_memory
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.run.memory_plan import choose_image_storage, image_bytes
+from sadgs_ns.training.run.memory_plan import ImageStorage, choose_image_storage, image_bytes
 from sadgs_ns.training.step.images import ImagePrefetcher, LazyImages, thread_count
 from sadgs_ns.training.step.structure_cache import StructureCache
 from sadgs_ns.training.step.views import TrainingViews
@@ -164,14 +164,14 @@ def sizes_of(number: int, side: int) -> Any:
     )
 
 
-def place_together(world: World, asked: str) -> tuple[str, str | None]:
+def place_together(world: World, asked: str) -> tuple[str, str]:
     """Place images where the host has room for those of one process, and the last finds less of it than the others."""
     datamanager = sizes_of(10, 100)
     datamanager.config.cache_images = asked
     free = 4.1 * image_bytes(datamanager) if world.rank == 0 else 3.9 * image_bytes(datamanager)
     pytest.MonkeyPatch().setattr(host_memory, "available_host_bytes", lambda: free)
-    line = choose_image_storage(datamanager, torch.device("cpu"))
-    return datamanager.config.cache_images, line
+    storage = choose_image_storage(datamanager, torch.device("cpu"))
+    return storage.where, storage.sentence
 
 
 @pytest.mark.hard_case(
@@ -182,7 +182,7 @@ def place_together(world: World, asked: str) -> tuple[str, str | None]:
 @pytest.mark.parametrize("asked", ["gpu", "cpu"])
 def test_processes_that_find_different_memory_place_their_images_alike(asked: str, tmp_path: Path):
     (first, line), (second, same_line) = run_ranks(place_together, 2, tmp_path, asked)
-    assert first == second == "compressed" and line == same_line and line is not None
+    assert first == second == "compressed" and line == same_line
     assert line.startswith("The images stay compressed and are decoded ahead of the steps: decoded ")
     of_each = "structure take 0.0009 GB in each process, and the host has 0.0018 GB free for each."
     assert asked == "gpu" or line.endswith(of_each)
@@ -193,10 +193,10 @@ def test_decoded_images_stay_on_the_host_where_all_processes_have_room(monkeypat
     datamanager.config.cache_images = "cpu"
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 4.1 * image_bytes(datamanager))
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert choose_image_storage(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
+    assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 0.0)
     monkeypatch.setenv("WORLD_SIZE", "1")  # One process keeps them where it is told to.
-    assert choose_image_storage(datamanager, torch.device("cpu")) is None and datamanager.config.cache_images == "cpu"
+    assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
 
 
 def test_processes_of_a_machine_share_the_cores(monkeypatch: pytest.MonkeyPatch):

@@ -1,4 +1,4 @@
-"""The documents' training loop, run as it is printed there, with the torch splatter instead of gsplat's kernels."""
+"""The example of a plain training loop, which docs/strategy.md prints, with the torch splatter for gsplat's kernels."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import gsplat
 import pytest
 import torch
 
+from examples import simple_trainer
 from helpers import gsplat_like
-from helpers.small_scenes import adam, camera, random_params
-from sadgs_ns.method import strategy as strategy_module
+from helpers.small_scenes import camera, random_params
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "strategy.md"
+CHECKOUT = Path(__file__).parents[2]
 WIDTH, HEIGHT, VIEWS, START = 64, 48, 3, 60
 
 
@@ -35,25 +35,28 @@ class Short(StructureAwareStrategy):
     min_observations: int = 1
 
 
-def block() -> str:
-    """The only Python in the document."""
-    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf8"), re.S)
-    return code
-
-
-def test_the_loop_of_the_document_runs_and_splits(monkeypatch: pytest.MonkeyPatch):
-    calls = 0
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Put the torch splatter in the place of gsplat's kernels; the list gets the number of Gaussians at each call."""
+    counts: list[int] = []
     signature = inspect.signature(gsplat.rasterization)
 
     def rasterization(*args: Any, packed: bool, **options: Any) -> Any:
-        nonlocal calls
-        calls += 1
+        counts.append(len(args[0]))
         signature.bind(*args, packed=packed, **options)  # gsplat's takes these arguments
         assert not packed
         return gsplat_like.rasterization(*args, **options)
 
-    monkeypatch.setattr(gsplat, "rasterization", rasterization)
-    monkeypatch.setattr(strategy_module, "StructureAwareStrategy", Short)
+    monkeypatch.setattr(simple_trainer, "rasterization", rasterization)
+    return counts
+
+
+def test_the_document_prints_the_example():
+    (printed,) = re.findall(r"```python\n(.*?)```", (CHECKOUT / "docs/strategy.md").read_text("utf8"), re.S)
+    assert printed == (CHECKOUT / "examples/simple_trainer.py").read_text("utf8")
+
+
+def test_the_loop_runs_and_splits(calls: list[int]):
     torch.manual_seed(0)
     params = random_params(START)
     params["scales"].data += 1.0  # up to 10 px, against squares of 4 px
@@ -64,13 +67,17 @@ def test_the_loop_of_the_document_runs_and_splits(monkeypatch: pytest.MonkeyPatc
     viewmats, Ks = (matrix.repeat(VIEWS, 1, 1) for matrix in camera(WIDTH, HEIGHT))
     viewmats[:, 0, 3] = torch.linspace(-0.2, 0.2, VIEWS)
     images = checker[None, ..., None].repeat(VIEWS, 1, 1, 3)
-    names: dict[str, Any] = {
-        "torch": torch, "params": params, "optimizers": adam(params), "images": images,
-        "viewmats": viewmats, "Ks": Ks, "width": WIDTH, "height": HEIGHT, "iterations": 38, "scene_scale": 1.0,
-    }  # fmt: skip
-    exec(block(), names)
-    assert calls == 38
+    simple_trainer.train(params, images, viewmats, Ks, 1.0, 38, Short())
+    assert len(calls) == 38
     assert len({len(parameter) for parameter in params.values()}) == 1
     assert len(params["means"]) > 2 * START, "a fine checker under coarse Gaussians must be split"
     assert all(parameter.isfinite().all() for parameter in params.values())
-    assert set(names["state"]) == {"scene_scale", "structure_steps"}, "the statistics end with densification"
+
+
+def test_the_program_learns_its_photos(calls: list[int], capsys: pytest.CaptureFixture[str]):
+    torch.manual_seed(0)
+    untrained = simple_trainer.main("cpu", 48, 36, iterations=1)
+    trained = simple_trainer.main("cpu", 48, 36, iterations=60)
+    assert trained > untrained + 3
+    assert max(calls) > calls[0]
+    assert re.search(r"^800 points became [\d,]+ Gaussians; PSNR \d+\.\d\d dB$", capsys.readouterr().out, re.MULTILINE)

@@ -18,8 +18,9 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.method.ops import Params
 
+Params = Mapping[str, Tensor] | torch.nn.ParameterDict
+"""The Gaussians' parameters by name, each with leading dimension N."""
 COPIES = 4
 """Tensors of a parameter's size: the parameter, its gradient and Adam's two moments. The mean over the last iterations
 takes the place of the statistics and of a split's copy, which are gone by then."""
@@ -115,7 +116,9 @@ def affordable_growth(params: Params, state: Mapping[str, Any], free: float, siz
     """
     if math.isinf(free):
         return free
-    n, widest, new_pairs = len(params["means"]), widest_bytes(params), PAIRS_PER_GAUSSIAN * size.views
+    n = len(params["means"])
+    widest = widest_bytes(params)
+    new_pairs = PAIRS_PER_GAUSSIAN * size.views
     kept = kept_bytes(params, state)
     growth = min(
         (free - n * (a + widest) - b - p * size.pairs) / (kept + widest + a + p * new_pairs)

@@ -1,0 +1,277 @@
+"""`python -m benchmarks chain PROTOCOL.yaml --photos ROOT --output rows.jsonl --label NAME`: from photos to the file.
+
+Other benchmarks compare renderings of a run with images that were undistorted before. This one starts from photos as
+they were taken, and compares the exported file with the original photos: it measures what a user gets.
+
+A chain is four commands of the package, in processes of their own: `sadgs-process` places the cameras of all photos,
+`ns-train sadgs` trains on all but every eighth photo, and `sadgs-export` writes the file; then `chain_score` draws the
+file and compares it with the photos that were held out. With `--site`, the commands are those of another version of
+the package, while the score is always this checkout's. Poses come from all photos, held-out ones included, as is usual.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from tyro.conf import Positional
+
+from benchmarks import results
+from benchmarks.chain_table import markdown
+
+INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
+SUFFIXES = {".jpg", ".jpeg", ".png"}
+POLL_SECONDS = 0.2
+LOADER = (
+    "import sys; from importlib.metadata import entry_points; name = sys.argv[1]; sys.argv = sys.argv[1:]; "
+    "(script,) = {s for s in entry_points(group='console_scripts') if s.name == name}; sys.exit(script.load()())"
+)
+"""A program that runs one of the package's commands, which need not be on the PATH."""
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What a chain benchmark runs."""
+
+    captures: dict[str, str]  # Folders of photos below a root, by the captures' names
+    seeds: list[int]  # Seeds of training
+    max_size: int = 1600  # Longest side of images in px, in training and in the comparison
+    effort: float = 1.0
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One way from photos to a score."""
+
+    capture: str
+    photos: Path
+    seed: int
+    label: str
+    max_size: int
+    effort: float
+
+    @property
+    def key(self) -> str:
+        """Name of this chain among the rows of a file."""
+        return f"{self.capture}/{self.label}/{self.seed}"
+
+
+def load(path: Path) -> Protocol:
+    """Read a protocol. Raises ValueError, one sentence, if it is not as `Protocol` says."""
+    try:
+        return Protocol(**yaml.safe_load(path.read_text("utf8")))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror}); give the YAML file of a chain.") from error
+    except (TypeError, yaml.YAMLError) as error:
+        told = " ".join(str(error).split())
+        raise ValueError(f"{path} must be YAML with captures and seeds: {told}.") from error
+
+
+def photos_of(folder: Path) -> list[str]:
+    """Return the names of a folder's photos in the order that decides which are held out."""
+    paths = [path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+    return sorted(path.relative_to(folder).as_posix() for path in paths)
+
+
+def held_out(names: Sequence[str]) -> list[str]:
+    """Return the photos that training does not see."""
+    return list(names[::INTERVAL])
+
+
+def hold_out(scene: Path, photos: Sequence[str]) -> int:
+    """Write into a scene's `transforms.json` which images are held out, and return the number of the others.
+
+    An image belongs to the photo whose name it has, perhaps with another suffix behind it.
+    """
+    file = scene / "transforms.json"
+    described = json.loads(file.read_text("utf8"))
+    tests = {f"images/{name}" for name in photos}
+    names = [frame["file_path"] for frame in described["frames"]]
+    held = [name for name in names if name in tests or name.rpartition(".")[0] in tests]
+    described["train_filenames"] = [name for name in names if name not in held]
+    described["val_filenames"] = held
+    described["test_filenames"] = held
+    file.write_text(json.dumps(described, indent=4), "utf8")
+    return len(names) - len(held)
+
+
+def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
+    """Run a chain in a folder and return its row.
+
+    Raises subprocess.CalledProcessError if a command fails; its output is in `work/log`.
+    """
+    environment = dict(os.environ)
+    checkout = str(Path(__file__).resolve().parents[1])
+    before = environment.get("PYTHONPATH", "")
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(site or checkout), before]))
+    seconds: dict[str, float] = {}
+
+    def call(stage: str, *words: str) -> None:
+        begin = time.perf_counter()
+        with (work / "log").open("ab") as log:
+            subprocess.run(
+                [sys.executable, "-c", LOADER, *words],
+                cwd=work,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                check=True,
+            )
+        seconds[stage] = round(time.perf_counter() - begin, 2)
+
+    scene = work / "scene"
+    call("cameras", "sadgs-process", str(chain.photos), str(scene), "--max-size", str(chain.max_size))
+    tests = held_out(photos_of(chain.photos))
+    train_views = hold_out(scene, tests)
+    run = work / "out" / "chain" / "sadgs" / "run"
+    options = ["--output-dir", str(work / "out"), "--experiment-name", "chain", "--timestamp", "run", "--vis", "none"]
+    options += ["--machine.seed", str(chain.seed), "--pipeline.effort", f"{chain.effort:g}", "--data", str(scene)]
+    call("training", "ns-train", "sadgs", *options)
+    splat = work / "splat.ply"
+    call("export", "sadgs-export", str(run), "--output", str(splat), "--frame", "colmap")
+    score = work / "score.json"
+    command = [sys.executable, "-m", "benchmarks.chain_score", str(scene), str(chain.photos), str(splat), str(score)]
+    subprocess.run([*command, "--max-size", str(chain.max_size)], env=dict(os.environ), check=True)
+    return {"seconds": seconds, "train_views": train_views, **json.loads(score.read_text())}
+
+
+def row_of(chain: Chain, work: Path, site: Path | None, log: Path) -> dict[str, Any]:
+    """Run a chain, and return its row, also that of one that fails; the output of that is added to a log."""
+    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    identity = {"key": chain.key, "scene": chain.capture, "label": chain.label, "seed": chain.seed, "date": date}
+    try:
+        return {**identity, "status": "ok", "error": None, **run_chain(chain, work, site)}
+    except subprocess.CalledProcessError as error:
+        output = (work / "log").read_text(errors="replace")
+        with log.open("a") as file:
+            file.write(f"=== {chain.key}\n{output}\n")
+        return {**identity, "status": "failed", "error": f"{error.cmd[3:5]} ended with code {error.returncode}"}
+
+
+@dataclass
+class Command:
+    """Measure the way from photos to the exported file, or what is left of it."""
+
+    protocol: Positional[Path]
+    """YAML file of captures and seeds"""
+    photos: Path
+    """folder that holds the captures' folders"""
+    output: Path
+    """JSON-lines file; chains already in it are skipped"""
+    label: str
+    """name of these rows, such as a commit"""
+    site: Path | None = None
+    """folder with another version of the package, whose commands run; the default is this checkout"""
+    only: str = ""
+    """captures to run, with commas between; the default is all"""
+    gpus: str | None = None
+    """such as 0,1: one chain at a time on each (default: one, on the first visible one)"""
+
+    def chains(self) -> list[Chain]:
+        """Return the chains that are asked for; raise ValueError if a capture is not there."""
+        protocol = load(self.protocol)
+        names = self.only.split(",") if self.only else list(protocol.captures)
+        for name in names:
+            if name not in protocol.captures:
+                raise ValueError(f"--only names {name!r}; the protocol has {', '.join(protocol.captures)}.")
+            if not photos_of(self.photos / protocol.captures[name]):
+                raise ValueError(f"{self.photos / protocol.captures[name]} holds no photos; check --photos.")
+        return [
+            Chain(
+                name,
+                (self.photos / protocol.captures[name]).resolve(),
+                seed,
+                self.label,
+                protocol.max_size,
+                protocol.effort,
+            )
+            for seed, name in itertools.product(protocol.seeds, names)
+        ]
+
+    def __call__(self) -> int:
+        """Run them; return 0, or 1 if one failed."""
+        chains = self.chains()
+        done = {row["key"] for row in results.read(self.output, missing_ok=True) if row["status"] == "ok"}
+        log = self.output.with_suffix(".log").resolve()
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        _run_side_by_side(
+            deque(chain for chain in chains if chain.key not in done), self.gpus, self.site, self.output.resolve(), log
+        )
+        rows = [row for row in results.read(self.output) if row["key"] in {chain.key for chain in chains}]
+        print(markdown(results.read(self.output)))
+        return int(any(row["status"] != "ok" for row in rows))
+
+
+def _run_side_by_side(chains: deque[Chain], gpus: str | None, site: Path | None, output: Path, log: Path) -> None:
+    """Run chains in processes, one at a time on each GPU, and append their rows to the output as they end."""
+    free = deque(gpus.split(",") if gpus else [None])
+    running: list[tuple[subprocess.Popen[bytes], Chain, str | None, Path]] = []
+    with tempfile.TemporaryDirectory(prefix="chain-", ignore_cleanup_errors=True) as folder:
+        try:
+            while running or chains:
+                while chains and free:
+                    chain = chains.popleft()
+                    gpu = free.popleft()
+                    work = Path(tempfile.mkdtemp(dir=folder))
+                    running.append((_start(chain, gpu, work, site, log), chain, gpu, work))
+                for run in [run for run in running if run[0].poll() is not None]:
+                    _, chain, gpu, work = run
+                    row = json.loads((work / "row.json").read_text())
+                    results.append(output, row)
+                    print(f"{chain.key}: {line(row)}", flush=True)
+                    running.remove(run)
+                    free.append(gpu)
+                    shutil.rmtree(work, ignore_errors=True)
+                time.sleep(POLL_SECONDS)
+        finally:
+            for process, *_ in running:
+                process.terminate()
+
+
+def _start(chain: Chain, gpu: str | None, work: Path, site: Path | None, log: Path) -> subprocess.Popen[bytes]:
+    environment = dict(os.environ)
+    if gpu is not None:
+        environment["CUDA_VISIBLE_DEVICES"] = gpu
+    checkout = str(Path(__file__).resolve().parents[1])
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, environment.get("PYTHONPATH", "")]))
+    spec = json.dumps({**dataclasses.asdict(chain), "photos": str(chain.photos)})
+    words = [spec, str(work), str(site.resolve()) if site else "", str(log)]
+    return subprocess.Popen([sys.executable, "-m", "benchmarks.chain", *words], env=environment)
+
+
+def line(row: Mapping[str, Any]) -> str:
+    """Return a finished chain in one line."""
+    if row["status"] != "ok":
+        return f"failed: {row['error']}"
+    stages = ", ".join(f"{stage} {value:.1f}" for stage, value in row["seconds"].items())
+    lpips = "" if row["lpips"] is None else f", LPIPS {row['lpips']:.4f}"
+    registered = f"{row['registered']} of {row['photos']} photos"
+    return f"PSNR {row['psnr']:.2f}, SSIM {row['ssim']:.4f}{lpips}; {registered}; seconds: {stages}"
+
+
+def main() -> None:
+    """Run one chain in this process and write its row; `_start` calls it."""
+    spec, work, site, log = sys.argv[1:]
+    fields = json.loads(spec)
+    chain = Chain(**{**fields, "photos": Path(fields["photos"])})
+    row = row_of(chain, Path(work), Path(site) if site else None, Path(log))
+    (Path(work) / "row.json").write_text(json.dumps(row), "utf8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Compare an exported file with original photos: `python -m benchmarks.chain_score SCENE PHOTOS SPLAT.ply OUT.json`.
+
+The score reads the photos as they were taken, the cameras with their distortion that `sadgs-process` placed, and the
+file; nothing that was undistorted or trained on enters it. The file is drawn at twice the photo's size by a pinhole
+camera, warped through the photo's distorted camera and reduced by area. The photo is reduced by area, too, if it is
+longer than the images of training. Other programs' viewers draw from `NEAR_PLANE` on and without a limit off the axis,
+so the score does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from sadgs_ns.gsplat_compat import NEAR_PLANE
+from sadgs_ns.render.rasterization import rasterize
+from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+
+Array = NDArray[np.float32]
+ENLARGED = 2  # Factor of the size at which the file is drawn, so that warping costs no detail
+MARGIN = 8  # px around what the photo sees, for the warp's kernel
+MOST_SIDE = 4.0  # Largest side of the drawn image, in those of the enlarged photo: lenses of 150° need more
+
+
+@dataclass(frozen=True)
+class Splat:
+    """The Gaussians of a file, activated."""
+
+    gaussians: Gaussians
+    degree: int
+
+
+def read_splat(file: Path, device: torch.device) -> Splat:
+    """Read a PLY in the layout of the original 3D Gaussian splatting code."""
+    from plyfile import PlyData
+
+    vertex = PlyData.read(str(file))["vertex"]
+
+    def columns(names: Sequence[str]) -> torch.Tensor:
+        values = np.stack([np.asarray(vertex[name], np.float32) for name in names], axis=1)
+        return torch.from_numpy(values).to(device)
+
+    rest = sum(name.startswith("f_rest_") for name in vertex.data.dtype.names)
+    bands = rest // 3
+    means = columns(["x", "y", "z"])
+    harmonics = columns([f"f_rest_{i}" for i in range(rest)]) if rest else means.new_zeros((len(means), 0))
+    gaussians = Gaussians(
+        means=means,
+        quats=columns([f"rot_{i}" for i in range(4)]),
+        scales=columns([f"scale_{i}" for i in range(3)]).exp(),
+        opacities=columns(["opacity"])[:, 0].sigmoid(),
+        # The file has colour before band.
+        colors=(columns([f"f_dc_{i}" for i in range(3)]), harmonics.view(-1, 3, bands).mT.contiguous()),
+    )
+    return Splat(gaussians, round(math.sqrt(1 + bands)) - 1)
+
+
+def read_photo(file: Path, max_size: int) -> Array:
+    """Read a photo upright in [0, 1], reduced by area to a longest side of at most `max_size` px. [H, W, 3]"""
+    with Image.open(file) as image:
+        pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGB"), np.float32) / 255
+    height, width = pixels.shape[:2]
+    scale = min(1.0, max_size / max(width, height)) if max_size else 1.0
+    size = (round(scale * width), round(scale * height))
+    if scale == 1:
+        return pixels
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+@torch.no_grad()
+def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[int, int]) -> Array:
+    """Draw a splat as a camera of COLMAP sees it, with its distortion.
+
+    Args:
+        splat: In the frame of the camera's poses.
+        camera: A pycolmap.Camera of the original photo.
+        viewmat: World to camera. [3, 4]
+        size: Width and height of the result in px.
+
+    Returns:
+        Colours in [0, 1]. [H, W, 3]
+    """
+    width, height = ENLARGED * size[0], ENLARGED * size[1]
+    # Rays through the centres of the enlarged image's pixels, in the photo's pixels and then without distortion.
+    x = (np.arange(width) + 0.5) * camera.width / width
+    y = (np.arange(height) + 0.5) * camera.height / height
+    pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    rays = np.asarray(camera.cam_from_img(pixels)).reshape(height, width, -1)[..., :2]
+    focal_x = camera.focal_length_x * width / camera.width
+    focal_y = camera.focal_length_y * height / camera.height
+    drawn_x, drawn_y = focal_x * rays[..., 0], focal_y * rays[..., 1]
+    left, right = _bounds(drawn_x, width)
+    top, bottom = _bounds(drawn_y, height)
+    device = splat.gaussians.means.device
+    K = torch.tensor([[focal_x, 0.0, -left], [0.0, focal_y, -top], [0.0, 0.0, 1.0]], device=device)
+    pose = torch.eye(4, device=device)
+    pose[:3] = torch.from_numpy(viewmat).to(pose)
+    cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
+    degree = splat.degree if splat.degree > 0 else 0
+    image, _, _ = rasterize(splat.gaussians, cameras, RenderOptions(sh_degree=degree, near_plane=NEAR_PLANE))
+    pinhole = image[0].clamp(0, 1).cpu().numpy()
+    # OpenCV numbers pixels by their centres.
+    at_x = (drawn_x - left - 0.5).astype(np.float32)
+    at_y = (drawn_y - top - 0.5).astype(np.float32)
+    warped = cv2.remap(pinhole, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.resize(warped, size, interpolation=cv2.INTER_AREA).clip(0, 1)
+
+
+def _bounds(values: NDArray[np.float64], side: int) -> tuple[int, int]:
+    """Return the first and the last pixel that a drawn image needs, which is not larger than MOST_SIDE sides."""
+    finite = values[np.isfinite(values)]
+    limit = MOST_SIDE / 2 * side
+    return math.floor(max(finite.min(), -limit)) - MARGIN, math.ceil(min(finite.max(), limit)) + MARGIN
+
+
+def model_folder(scene: Path) -> Path:
+    """Return the folder of the model with the distorted cameras in a scene of `sadgs-process`."""
+    settings = json.loads((scene / "work" / "settings.json").read_text("utf8"))
+    return scene / "work" / settings["model"]
+
+
+def photo_of(image: str, photos: Sequence[str]) -> str | None:
+    """Return the photo of a model's image, whose name is the photo's, or that and another suffix."""
+    if image in photos:
+        return image
+    without = image.rpartition(".")[0]
+    return without if without in photos else None
+
+
+def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Sequence[str]) -> dict[str, Any]:
+    """Compare held-out photos with the file; `names` are all photos, in the order that decides which are held out.
+
+    Returns:
+        `views`: PSNR in dB, SSIM and LPIPS (None without its weights) of each held-out photo by its name; their means
+        `psnr`, `ssim` and `lpips`, and `worst`, the least PSNR; the numbers of `photos` and `registered` ones; and the
+        names of those held out that did not register, `missing`.
+    """
+    import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+    from benchmarks.chain import held_out
+    from benchmarks.evaluate import load_lpips
+
+    model = pycolmap.Reconstruction(model_folder(scene))
+    images = {photo_of(image.name, names): image for image in model.images.values() if image.has_pose}
+    device = splat.gaussians.means.device
+    network = load_lpips()
+    if network is not None:
+        network.to(device)
+    views: dict[str, list[float | None]] = {}
+    for name in held_out(names):
+        if name not in images:
+            continue
+        image = images[name]
+        photo = read_photo(photos / name, max_size)
+        size = (photo.shape[1], photo.shape[0])
+        drawn = draw(splat, image.camera, image.cam_from_world().matrix(), size)
+        pair = [torch.from_numpy(pixels).movedim(-1, 0)[None].to(device) for pixels in (drawn, photo)]
+        rendered, truth = pair
+        psnr = float(peak_signal_noise_ratio(rendered, truth, data_range=1.0))
+        ssim: Any = structural_similarity_index_measure(rendered, truth, data_range=1.0, sigma=1.5, kernel_size=11)
+        lpips = None
+        if network is not None:
+            with torch.no_grad():
+                lpips = round(float(network(rendered, truth)), 4)
+        views[name] = [round(psnr, 3), round(float(ssim), 4), lpips]
+    columns = list(zip(*views.values(), strict=True))
+    return {
+        "photos": len(names),
+        "registered": len(images),
+        "missing": [name for name in held_out(names) if name not in images],
+        "views": views,
+        "psnr": statistics.fmean(columns[0]),
+        "ssim": statistics.fmean(columns[1]),
+        "lpips": None if network is None else statistics.fmean(columns[2]),
+        "worst": min(columns[0]),
+    }
+
+
+def main() -> None:
+    """Write the score of a file."""
+    from benchmarks.chain import photos_of
+    from benchmarks.run import software
+
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.chain_score", description=__doc__)
+    for name in ("scene", "photos", "splat", "output"):
+        parser.add_argument(name, type=Path)
+    parser.add_argument("--max-size", type=int, default=1600)
+    options = parser.parse_args()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    splat = read_splat(options.splat, device)
+    score = compare(options.scene, options.photos, splat, options.max_size, photos_of(options.photos))
+    score["gaussians"] = len(splat.gaussians.means)
+    score["megabytes"] = round(options.splat.stat().st_size / 1e6, 1)
+    score["gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+    score["versions"] = software()
+    options.output.write_text(json.dumps(score), "utf8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+"""Readers of image files: their headers, sizes and colours, and the names of their smaller copies and masks."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
+
+from sadgs_ns.errors import reason
+
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp"}
+"""Suffixes of the formats of photos that training reads."""
+MAX_AUTO_RESOLUTION = 1600  # Longest side in px up to which nerfstudio looks for no smaller copies of images
+NOT_UPRIGHT = range(2, 9)  # EXIF's orientations of turned or mirrored images. Pillow turns TIFF by itself, but no other
+SIDEWAYS = range(5, 9)  # Those of them that exchange the sides
+Rounding = Literal["floor", "round", "ceil"]
+Size = tuple[int, int]  # Width and height in px
+
+
+@dataclass(frozen=True)
+class Frame:
+    """An image, the size that its camera has, and its mask."""
+
+    image: Path
+    size: Size | None  # The camera's size; None if it has none of its own
+    mask: Path | None = None
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of an image file."""
+
+    size: Size = (0, 0)  # Zeros if it is unknown
+    mode: str = ""  # Pillow's name for the kind of pixels
+    format: str = ""  # Pillow's name for the format of the file
+    orientation: int = 1  # As EXIF gives it
+    has_profile: bool = False  # Whether its colours are others than sRGB's
+    problem: str = ""  # The rest of a sentence that starts with the file; empty for a good image
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the images directly in a folder, sorted; none if there is no folder."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+
+
+def read_header(path: Path) -> Header:
+    """Read an image's header, and decode the image only if the end of the file does not show that it is whole.
+
+    A file that cannot be read has a header with a problem.
+    """
+    remedy = "copy it again, or leave it out of the reconstruction"
+    try:
+        if path.stat().st_size == 0:
+            return Header(problem=f"has 0 bytes: {remedy}")
+        with Image.open(path) as image:
+            orientation = 1
+            with suppress(Exception):  # Damaged EXIF matters to no one. A PNG's own method would decode the image.
+                orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
+            has_profile = color_profile(image) is not None
+            header = Header(image.size, image.mode, image.format or "", orientation, has_profile)
+            is_whole = _ends_well(path, image)
+        if not is_whole:
+            with Image.open(path) as image:
+                image.load()
+        return header
+    except FileNotFoundError:
+        return Header(problem="does not exist: put it there, or leave it out of the reconstruction")
+    except UnidentifiedImageError:
+        return Header(problem=f"is no image that Pillow knows: {remedy}")
+    except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
+        return Header(problem=f"cannot be read as an image ({reason(error)}): {remedy}")
+
+
+def _ends_well(path: Path, image: Image.Image) -> bool:
+    """Return whether an open image is whole for sure; if not, only decoding shows whether it is."""
+    if image.format == "JPEG":
+        with path.open("rb") as file:
+            file.seek(-2, 2)
+            return file.read() == b"\xff\xd9"
+    if image.format != "PNG":
+        return False
+    with suppress(Exception):  # It raises anything, even if only the last bytes are missing, which decodes well.
+        image.verify()  # This reads its checksums.
+        return True
+    return False
+
+
+def image_size(path: Path) -> Size:
+    """Return width and height in px, or zeros if they cannot be read."""
+    return read_header(path).size
+
+
+def color_profile(image: Image.Image) -> ImageCms.ImageCmsProfile | None:
+    """Return the profile of an image's colours if they are others than sRGB's, such as a phone's Display P3."""
+    if image.mode not in ("RGB", "RGBA", "CMYK"):
+        return None
+    with suppress(KeyError, OSError, ImageCms.PyCMSError):  # Most have none, and some a damaged one.
+        profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
+        if "sRGB" not in ImageCms.getProfileDescription(profile):
+            return profile
+    return None
+
+
+def read_small(path: Path) -> NDArray[np.uint8] | None:
+    """Return an image's colours [H, W, 3], of a JPEG scaled down as it is decoded; None if it cannot be read."""
+    try:
+        with Image.open(path) as image:
+            image.draft("RGB", (160, 160))  # It keeps at least as many px.
+            return np.asarray(image.convert("RGB"))
+    except Exception:  # The check of images names broken ones.
+        return None
+
+
+def is_flat(path: Path, black: bool = False) -> bool:
+    """Return whether all visible pixels have one colour, or are black if asked, as those of a mask may be.
+
+    A JPEG is decoded at an eighth of its size to find one colour.
+    """
+    try:
+        with Image.open(path) as image:
+            if not black:
+                image.draft(None, (image.width // 8, image.height // 8))
+            shown = image
+            if image.mode == "RGBA":
+                shown = image.convert("RGBa")  # Transparent pixels become black.
+            extrema: Any = shown.getextrema()
+    except Exception:  # A decoder's failure shows no single colour, and nerfstudio's reader may yet read the file.
+        return False
+    channels = extrema
+    if not isinstance(extrema[0], tuple):  # The image has one channel.
+        channels = [extrema]
+    if black:
+        return all(low == high == 0 for low, high in channels)
+    return all(low == high for low, high in channels)
+
+
+def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:
+    """Return a camera's width and height after nerfstudio scaled them down, in its float32."""
+    width, height = (float(np.float32(side) * np.float32(1.0 / factor)) for side in size)
+    if rounding == "floor":
+        return math.floor(width), math.floor(height)
+    if rounding == "ceil":
+        return math.ceil(width), math.ceil(height)
+    return math.floor(width + 0.5), math.floor(height + 0.5)
+
+
+def rounding_of(image: Path, copy: Path, factor: int) -> Rounding:
+    """Return how the sides of an image's smaller copy were rounded; "floor", nerfstudio's default, if none fits."""
+    size = image_size(image)
+    copy_size = image_size(copy)
+    for rounding in get_args(Rounding):
+        if scaled_size(size, factor, rounding) == copy_size:
+            return rounding
+    return "floor"
+
+
+def smaller_folder(folder: Path, factor: int) -> Path:
+    """Return the folder in which nerfstudio keeps copies of a folder's images that are smaller by a factor."""
+    if factor <= 1:
+        return folder
+    return folder.with_name(f"{folder.name}_{factor}")
+
+
+def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) -> int:
+    """Return the factor by which nerfstudio scales images down if the user names none.
+
+    It is the smallest power of 2 that makes the image's sides 1600 px or less. If `copy_of` returns where the copy for
+    a factor would lie, the factor is only as large as there are copies, as for a `transforms.json`.
+    """
+    longest = max(image_size(image))
+    factor = 1
+    while longest / factor > MAX_AUTO_RESOLUTION:
+        if copy_of is not None and not copy_of(2 * factor).exists():
+            break
+        factor *= 2
+    return factor
+
+
+def mask_name(folder: Path, image: str) -> Path:
+    """Return the file of an image's mask, relative to a folder of masks, by the first name in use that exists there."""
+    stem = PurePosixPath(image).with_suffix("")
+    names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]
+    return next((name for name in names if (folder / name).is_file()), names[0])

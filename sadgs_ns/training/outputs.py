@@ -1,0 +1,40 @@
+"""The outputs of a model for nerfstudio's programs: some are computed when they are read, and the viewer's differ."""
+
+from __future__ import annotations
+
+import threading
+from collections import UserDict
+from functools import lru_cache
+from typing import Any
+
+from torch import Tensor
+
+from sadgs_ns.training.run.progress import warn
+
+
+class LazyOutputs(UserDict[str, Any]):
+    """Tensors by name, or functions that compute them when they are first read.
+
+    nerfstudio does not tell a model which outputs it needs. Without this, each output would cost `ns-eval` and
+    `ns-render` time.
+    """
+
+    def __getitem__(self, name: str) -> Tensor:
+        value: Any = self.data[name]
+        if callable(value):
+            value = value()
+            self.data[name] = value
+        return value
+
+
+def in_viewer() -> bool:
+    """Tell whether nerfstudio's viewer draws in this thread."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine  # It imports viser.
+
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+@lru_cache(maxsize=8)
+def warn_once(text: str) -> None:
+    """Print a warning, unless it was printed before."""
+    warn(text)
