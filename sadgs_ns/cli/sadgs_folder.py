@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,18 +46,20 @@ class Settings:
         stored = read_settings(file, folder)
         if not stored:
             return None
-        values = {}
-        for name in (each.name for each in fields(cls)):
+        settings = cls()
+        for name in vars(settings):
             value = stored.get(_OPTION_NAMES.get(name, name))
             if value is not None:
-                values[name] = value
-        return cls(**values)
+                setattr(settings, name, value)
+        return settings
 
     def write(self, file: Path) -> None:
         """Write the settings, so that they are complete or as they were before."""
-        write_json(
-            file, {_OPTION_NAMES.get(name, name): value for name, value in vars(self).items() if value is not None}
-        )
+        stored = {}
+        for name, value in vars(self).items():
+            if value is not None:
+                stored[_OPTION_NAMES.get(name, name)] = value
+        write_json(file, stored)
 
 
 class SadgsFolder:

@@ -40,21 +40,21 @@ def make_model(colmap: Worker, *arguments: Any, folder: Path, report: Report) ->
 
     Raise an InputError of the function, OSError if the disk is full, or RunError if it fails otherwise.
     """
-    begun = "its start"
+    present_stage = "its start"
 
     def on_event(event: str, stage: str, done: int, total: int) -> None:
-        nonlocal begun
-        begun = stage
+        nonlocal present_stage
+        present_stage = stage
         report(stage, done, total)
 
     try:
         return colmap.run(*arguments, on_event=on_event)
     except WorkerError as error:
-        raise _error_of(error, begun, folder) from None
+        raise _explain(error, present_stage, folder) from None
 
 
-def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
-    told = [_LOG_PREFIX.sub("", line).strip() for line in error.output.splitlines() if _ERROR_LINE.search(line)]
+def _explain(error: WorkerError, stage: str, folder: Path) -> OSError | RunError:
+    """Return the exception for the end of COLMAP's process, whose message names the stage and the remedy."""
     if _FULL_DISK.search(error.output) or shutil.disk_usage(folder).free < _FULL_BELOW:
         problem = f"{folder} could not be written while COLMAP worked on {stage} ({free_space(folder)} free there)"
         return OSError(f"{problem}: make room, and run the same command again to resume.")
@@ -62,5 +62,8 @@ def _error_of(error: WorkerError, stage: str, folder: Path) -> Exception:
         problem = f"COLMAP was killed while it worked on {stage}, most likely for want of memory"
         remedy = "close other programs, or give it smaller photos, and run the same command again to resume"
         return RunError(f"{problem}: {remedy}.")
-    why = f"({told[-1]})" if told else f"(exit code {error.exitcode})"
-    return RunError(f"COLMAP failed while it worked on {stage} {why}; run the same command to try again.")
+    cause = f"exit code {error.exitcode}"
+    for line in error.output.splitlines():
+        if _ERROR_LINE.search(line):
+            cause = _LOG_PREFIX.sub("", line).strip()
+    return RunError(f"COLMAP failed while it worked on {stage} ({cause}); run the same command to try again.")

@@ -27,64 +27,97 @@ def convert_photos(folder: Path, photos: Sequence[Photo], converted: Path) -> tu
     The folder `converted` then holds conversions, and links to the other photos, unless it exists already. Return the
     folder of photos that COLMAP reads, and the photos and views in it. Raise InputError if one would replace another.
     """
-
-    def converted_name(photo: Photo) -> str:
-        suffix = Path(photo.name).suffix.lower()
-        if suffix in _KEPT_SUFFIXES and not (photo.has_alpha and suffix in (".jpg", ".jpeg")):
-            return photo.name
-        return photo.name + (".png" if photo.has_alpha else ".jpg")
-
-    new = [dataclasses.replace(view, name=converted_name(view)) for photo in photos for view in photo.views]
-    if doubles := [name for name, number in Counter(view.name for view in new).items() if number > 1]:
+    new = []
+    for photo in photos:
+        new += [dataclasses.replace(view, name=_converted_name(view)) for view in photo.views]
+    counts = Counter(view.name for view in new)
+    doubles = [name for name, count in counts.items() if count > 1]
+    if doubles:
         raise InputError(f"{folder}: converted, two photos would be called {doubles[0]}; rename one of them.")
     if new == list(photos) and all(photo.is_read and not photo.is_turned for photo in photos):
         return folder, new
     if converted.exists():
         return converted, new
     partial = empty_folder(converted.with_name(f"{converted.name}.partial"))
-
-    def convert(photo: Photo) -> None:
-        source = Path(os.path.realpath(folder / photo.name))
-        targets = [partial / converted_name(view) for view in photo.views]
-        targets[0].parent.mkdir(parents=True, exist_ok=True)
-        if photo.is_turned or not photo.is_read or photo.is_panorama:
-            with Image.open(source) as image:
-                exif = Image.Exif() if image.format == "TIFF" else image.getexif()  # A TIFF's tells of its pixels, too.
-                image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
-                pixels = ImageOps.exif_transpose(image) if photo.is_turned else image
-                exif.pop(ExifTags.Base.Orientation, None)
-                kept = b""
-                with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
-                    kept = exif.tobytes()
-                if pixels.mode != "I;16":
-                    pixels = _in_srgb(pixels, "RGBA" if photo.has_alpha else "RGB")
-                for part, target in zip(cut(pixels) if photo.is_panorama else [pixels], targets, strict=True):
-                    part.save(target, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
-            return
-        try:
-            targets[0].symlink_to(source)
-        except OSError:  # Some file systems hold no links.
-            shutil.copyfile(source, targets[0])
-
     with threads() as pool:
-        list(pool.map(convert, photos))
+        list(pool.map(lambda photo: _convert(photo, folder, partial), photos))
     partial.rename(converted)
     return converted, new
 
 
+def _converted_name(photo: Photo) -> str:
+    """Return the name of a photo or view after its conversion; its suffix is one by which COLMAP writes."""
+    suffix = Path(photo.name).suffix.lower()
+    is_jpeg = suffix in (".jpg", ".jpeg")
+    if suffix in _KEPT_SUFFIXES and not (photo.has_alpha and is_jpeg):
+        return photo.name
+    if photo.has_alpha:
+        return f"{photo.name}.png"
+    return f"{photo.name}.jpg"
+
+
+def _convert(photo: Photo, folder: Path, target: Path) -> None:
+    """Write the conversion or the views of a photo to the folder `target`, or a link to it if it needs none."""
+    source = Path(os.path.realpath(folder / photo.name))
+    files = [target / _converted_name(view) for view in photo.views]
+    files[0].parent.mkdir(parents=True, exist_ok=True)
+    if photo.is_turned or photo.is_panorama or not photo.is_read:
+        with Image.open(source) as image:
+            exif = Image.Exif()
+            if image.format != "TIFF":  # A TIFF's tells of its pixels, too.
+                exif = image.getexif()
+            image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
+            pixels = _upright_pixels(image, photo)
+            kept = _without_orientation(exif)  # Only now, since `image` needs it to be turned.
+            parts = [pixels]
+            if photo.is_panorama:
+                parts = cut(pixels)
+            for part, file in zip(parts, files, strict=True):
+                part.save(file, exif=kept, quality=97, subsampling=0)  # the latter two for JPEG alone
+        return
+    try:
+        files[0].symlink_to(source)
+    except OSError:  # Some file systems hold no links.
+        shutil.copyfile(source, files[0])
+
+
+def _without_orientation(exif: Image.Exif) -> bytes:
+    """Remove the orientation from EXIF data, and return these as a file holds them, empty if they are damaged."""
+    exif.pop(ExifTags.Base.Orientation, None)
+    with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
+        return exif.tobytes()
+    return b""
+
+
+def _upright_pixels(image: Image.Image, photo: Photo) -> Image.Image:
+    """Turn an image as its EXIF data says, and convert it to sRGB unless it has 16 bits."""
+    if photo.is_turned:
+        image = ImageOps.exif_transpose(image)
+    if image.mode == "I;16":
+        return image
+    mode = "RGB"
+    if photo.has_alpha:
+        mode = "RGBA"
+    return _in_srgb(image, mode)
+
+
 def _in_srgb(image: Image.Image, mode: str) -> Image.Image:
     """Convert an image to RGB or RGBA in sRGB, since training and viewers know no profiles."""
-    if (profile := color_profile(image)) is None:
+    profile = color_profile(image)
+    if profile is None:
         return image.convert(mode)
-    image = image if image.mode == "CMYK" else image.convert(mode)
+    if image.mode != "CMYK":
+        image = image.convert(mode)
     with contextlib.suppress(ImageCms.PyCMSError):  # The profile is of another kind of pixels.
-        image = ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode=mode) or image
+        srgb = ImageCms.createProfile("sRGB")
+        image = ImageCms.profileToProfile(image, profile, srgb, outputMode=mode) or image
     return image.convert(mode)
 
 
 def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
     """Empty `alphas`, write the opacity of each partly transparent photo `NAME` there as `NAME.png`, and count them."""
     empty_folder(alphas)
+    count = 0
     for photo in photos:
         if photo.has_alpha:
             with Image.open(folder / photo.name) as image:
@@ -93,7 +126,8 @@ def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
                 target = alphas / f"{photo.name}.png"
                 target.parent.mkdir(parents=True, exist_ok=True)
                 alpha.save(target)
-    return sum(1 for _ in alphas.rglob("*.png"))
+                count += 1
+    return count
 
 
 def write_masks(
@@ -107,25 +141,39 @@ def write_masks(
     for photo in photos:
         mask = Image.new("L", photo.size, 255)
         if photo.name in masks:
-            with Image.open(folder / masks[photo.name]) as image, Image.open(folder / photo.name) as stored:
-                grey = np.asarray(image.convert("L"))
-                mask = Image.fromarray(np.uint8(255 * (grey > grey.max() // 2)))
-                if photo.is_turned and (mask.width > mask.height) != (photo.size[0] > photo.size[1]):
-                    mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
-                    mask = ImageOps.exif_transpose(mask)
-        if not 0.97 < mask.width * photo.size[1] / (mask.height * photo.size[0]) < 1.03:
-            problem = f"{folder / masks[photo.name]} has another shape than {photo.name}, whose mask it is by its name"
-            raise InputError(f"{problem}: make it of the whole photo, or take it out of the folder.")
-        mask = mask.resize(photo.size, Image.Resampling.NEAREST)
-        for part, name in zip(cut(mask) if photo.is_panorama else [mask], names, strict=False):
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            part.save(target / name)
+            mask = _read_mask(folder / masks[photo.name], photo, folder / photo.name)
+        parts = [mask]
+        if photo.is_panorama:
+            parts = cut(mask)
+        for part in parts:
+            file = target / next(names)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            part.save(file)
+
+
+def _read_mask(file: Path, photo: Photo, photo_file: Path) -> Image.Image:
+    """Read a mask, upright and in the photo's size, in black and white; raise InputError if it has another shape."""
+    with Image.open(file) as image:
+        grey = np.asarray(image.convert("L"))
+    mask = Image.fromarray(np.uint8(255 * (grey > grey.max() // 2)))
+    width, height = photo.size
+    lies_on_side = (mask.width > mask.height) != (width > height)
+    if photo.is_turned and lies_on_side:  # It was made of the photo as that is stored.
+        with Image.open(photo_file) as stored:
+            mask.getexif()[ExifTags.Base.Orientation] = stored.getexif()[ExifTags.Base.Orientation]
+        mask = ImageOps.exif_transpose(mask)
+    stretch = mask.width * height / (mask.height * width)
+    if not 0.97 < stretch < 1.03:
+        problem = f"{file} has another shape than {photo.name}, whose mask it is by its name"
+        raise InputError(f"{problem}: make it of the whole photo, or take it out of the folder.")
+    return mask.resize(photo.size, Image.Resampling.NEAREST)
 
 
 def restore_alpha(images: Path, alphas: Path) -> None:
     """Give those images that exist the opacity that `write_alpha` wrote, which has their size."""
     for path in alphas.rglob("*.png"):
-        if (target := images / path.relative_to(alphas).with_suffix("")).exists():
+        target = images / path.relative_to(alphas).with_suffix("")
+        if target.exists():
             with Image.open(target) as image, Image.open(path) as alpha:
                 pixels = image.convert("RGB")
                 pixels.putalpha(alpha.convert("L"))

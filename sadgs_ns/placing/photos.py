@@ -41,10 +41,14 @@ class Photo:
     @property
     def views(self) -> list[Photo]:
         """The views that a panorama is cut into, without a camera of their own; another photo is its own view."""
-        suffix = "png" if self.has_alpha else "jpg"
-        size = (self.size[1] // 2, self.size[1] // 2)
+        if not self.is_panorama:
+            return [self]
+        suffix = "jpg"
+        if self.has_alpha:
+            suffix = "png"
+        side = self.size[1] // 2
         names = [f"{self.name}/{i}.{suffix}" for i in range(VIEWS)]
-        return [Photo(name, size, (), self.has_alpha) for name in names] if self.is_panorama else [self]
+        return [Photo(name, (side, side), (), self.has_alpha) for name in names]
 
 
 def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, int], None]) -> list[Photo]:
@@ -56,25 +60,40 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
         try:
             return _read_photo(folder, name)
         except UnidentifiedImageError:
-            why = "no image that Pillow knows" if (folder / name).stat().st_size else "0 bytes"
+            problem = "no image that Pillow knows"
+            if (folder / name).stat().st_size == 0:
+                problem = "0 bytes"
         except Exception as error:  # Decoders raise whatever they stumble over.
-            why = reason(error)
-        return f"{name} ({why})"
+            problem = reason(error)
+        return f"{name} ({problem})"
 
     with threads() as pool:
         for done, found in enumerate(pool.map(read, names), 1):
-            photos.append(found) if isinstance(found, Photo) else broken.append(found)
+            if isinstance(found, Photo):
+                photos.append(found)
+            else:
+                broken.append(found)
             report("photos", done, len(names))
     if broken:
-        more = [f"{len(broken) - _NAMED} more"] if len(broken) > _NAMED else []
-        them = "it" if len(broken) == 1 else "them"
-        problem = f"{len(broken)} of the {len(names)} photos in {folder} cannot be read as a whole image"
-        raise InputError(f"{problem}: {', '.join(broken[:_NAMED] + more)}; copy {them} again or remove {them}.")
+        raise InputError(_explain_broken(folder, broken, len(names)))
     looks: dict[tuple[int, int], list[bool]] = defaultdict(list)
     for photo in photos:
         looks[photo.size].append(photo.is_panorama)
     # Of one size all are panoramas or none is, because single ones may look otherwise.
-    return [dataclasses.replace(photo, is_panorama=bool(np.mean(looks[photo.size]) >= 0.5)) for photo in photos]
+    sizes_of_panoramas = {size for size, votes in looks.items() if np.mean(votes) >= 0.5}
+    return [dataclasses.replace(photo, is_panorama=photo.size in sizes_of_panoramas) for photo in photos]
+
+
+def _explain_broken(folder: Path, broken: Sequence[str], total: int) -> str:
+    """Return the sentence on photos that cannot be read, given each one's name and problem."""
+    shown = list(broken[:_NAMED])
+    if len(broken) > _NAMED:
+        shown.append(f"{len(broken) - _NAMED} more")
+    them = "them"
+    if len(broken) == 1:
+        them = "it"
+    problem = f"{len(broken)} of the {total} photos in {folder} cannot be read as a whole image"
+    return f"{problem}: {', '.join(shown)}; copy {them} again or remove {them}."
 
 
 @contextlib.contextmanager
@@ -98,16 +117,23 @@ def _read_photo(folder: Path, name: str) -> Photo:
         exif = image.getexif()
         orientation = exif.get(ExifTags.Base.Orientation)
         width, height = image.size
-        size = (height, width) if orientation in SIDEWAYS and image.format != "TIFF" else image.size
+        size = (width, height)
+        if orientation in SIDEWAYS and image.format != "TIFF":
+            size = (height, width)
         lens = exif.get_ifd(ExifTags.IFD.Exif)
         focals = [str(lens.get(tag) or None) for tag in _FOCAL_LENGTHS]  # as text: 0/0 is not equal to itself
-        camera = size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals
+        camera = (size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals)
         has_alpha = image.has_transparency_data
         is_read = image.format in COLMAP_FORMATS and image.mode not in ("CMYK", "LAB")  # A TIFF would stay CMYK.
-        is_read &= color_profile(image) is None
+        if color_profile(image) is not None:
+            is_read = False
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
-        least = 512 if width == 2 * height else 0
-        image.draft("RGB", (max(least, width // 8), max(least // 2, height // 8)))
+        draft_width = width // 8
+        draft_height = height // 8
+        if width == 2 * height:
+            draft_width = max(512, draft_width)
+            draft_height = max(256, draft_height)
+        image.draft("RGB", (draft_width, draft_height))
         image.load()
         return Photo(name, size, camera, has_alpha, is_read, orientation in NOT_UPRIGHT, is_panorama(image, size))
 
@@ -129,5 +155,12 @@ def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
 
 def in_order(names: Sequence[str]) -> list[str]:
     """Sort names so that photo 10 comes after photo 9."""
-    parts = {name: re.split(r"(\d+)", name) for name in names}
-    return sorted(names, key=lambda name: [int(part) if part.isdecimal() else part for part in parts[name]])
+    return sorted(names, key=_parts)
+
+
+def _parts(name: str) -> list[str | int]:
+    """Divide a name into its numbers and what stands between them."""
+    parts: list[str | int] = list(re.split(r"(\d+)", name))
+    for i in range(1, len(parts), 2):  # Every other part is a number.
+        parts[i] = int(parts[i])
+    return parts

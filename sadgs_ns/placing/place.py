@@ -141,11 +141,9 @@ def _describe_photos(scene: Scene, photos: Sequence[Photo], say: Say) -> None:
             held_out = "all those of a panorama"
         else:
             held_out = "single ones"
-        say(
-            "panoramas",
-            f"{panoramas} of the {len(photos)} photos are panoramas: each is cut into {VIEWS} views of 90°, which "
-            f"leave out 30° about the zenith and the nadir; {held_out} are held out.",
-        )
+        found = f"{panoramas} of the {len(photos)} photos are panoramas"
+        views = f"each is cut into {VIEWS} views of 90°, which leave out 30° about the zenith and the nadir"
+        say("panoramas", f"{found}: {views}; {held_out} are held out.")
 
 
 def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> tuple[Path, list[Photo]]:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 from sadgs_ns.placing.photos import threads
 
+_CHECKED_BYTES = 1 << 26  # Size of the beginning of a file that its checksum is of
+
 
 def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
     """Return size in bytes, time of the last change in ns and checksum of the beginning of each photo or video."""
@@ -15,10 +17,12 @@ def photo_stamps(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
     def stamp(name: str) -> list[int]:
         status = (folder / name).stat()
         with (folder / name).open("rb") as file:
-            return [status.st_size, status.st_mtime_ns, zlib.crc32(file.read(1 << 26))]
+            checksum = zlib.crc32(file.read(_CHECKED_BYTES))
+        return [status.st_size, status.st_mtime_ns, checksum]
 
     with threads() as pool:
-        return dict(zip(names, pool.map(stamp, names), strict=True))
+        stamps = pool.map(stamp, names)
+        return dict(zip(names, stamps, strict=True))
 
 
 def changes_of(folder: Path, stamps: Mapping[str, Sequence[int]], names: Sequence[str]) -> dict[str, str]:
@@ -26,9 +30,24 @@ def changes_of(folder: Path, stamps: Mapping[str, Sequence[int]], names: Sequenc
 
     Those of the same size and time are not read. The same content at another time, as in a copy, is no change.
     """
-    there = {name: (folder / name).stat() for name in names if name in stamps and (folder / name).exists()}
-    touched = [name for name, now in there.items() if [now.st_size, now.st_mtime_ns] != list(stamps[name][:2])]
-    now = photo_stamps(folder, touched)
-    changed = {name for name in touched if (now[name][0], now[name][2]) != (stamps[name][0], stamps[name][2])}
-    changes = {"changed": changed, "added": {*names} - stamps.keys(), "removed": stamps.keys() - {*names}}
-    return {verb: f"{verb}: {len(n)}, such as {min(n) or folder.name}" for verb, n in changes.items() if n}
+    touched = [name for name in names if name in stamps and _is_touched(folder / name, stamps[name])]
+    changed = set()
+    for name, now in photo_stamps(folder, touched).items():
+        before = stamps[name]
+        if now[0] != before[0] or now[2] != before[2]:
+            changed.add(name)
+    changes = {"changed": changed, "added": set(names) - stamps.keys(), "removed": stamps.keys() - set(names)}
+    sentences = {}
+    for change, files in changes.items():
+        if files:
+            example = min(files) or folder.name  # A single video has no name in its folder.
+            sentences[change] = f"{change}: {len(files)}, such as {example}"
+    return sentences
+
+
+def _is_touched(file: Path, stamp: Sequence[int]) -> bool:
+    """Return whether a file has another size or time than when it was stamped; one that is missing has not."""
+    if not file.exists():
+        return False
+    status = file.stat()
+    return status.st_size != stamp[0] or status.st_mtime_ns != stamp[1]

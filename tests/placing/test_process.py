@@ -49,7 +49,9 @@ from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_masks
 from sadgs_ns.placing.folder import find_source, look_into
+from sadgs_ns.placing.options import PlacingOptions
 from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
+from sadgs_ns.placing.place import Placed, place_photos
 from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
@@ -960,6 +962,29 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: C
     registered(6)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 0
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
+
+
+def test_the_library_tells_its_caller_and_prints_nothing(
+    tmp_path: Path, registered: Callable[[int], None], capsys: pytest.CaptureFixture[str]
+):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "a.HEIC").write_bytes(b"a")
+    options = PlacingOptions(photos, tmp_path / "out")
+    steps, events = list[tuple[str, int, int]](), list[str]()
+
+    def place_again() -> Placed:
+        return place_photos(options, lambda *step: steps.append(step), lambda event, sentence: events.append(event))
+
+    registered(9)
+    placed = place_again()
+    assert placed.summary.registered == 9 and placed.unused[0].endswith(": 1, such as a.HEIC.")
+    assert steps == [("photos", i, 3) for i in (1, 2, 3)] and events == []
+    (tmp_path / "out" / "transforms.json").write_text("{}")
+    assert place_again() == placed and events == ["unchanged"] and len(steps) == 3
+    for wrong, told in (({"frames": 2}, "--frames must be at least 3"), ({"max_size": 63}, "--max-size must be at l")):
+        with pytest.raises(InputError, match=told):
+            place_photos(dataclasses.replace(options, **wrong), print, print)
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.hard_case(
