@@ -46,7 +46,8 @@ class Similarity:
         deviation = np.abs(linear - scale * orthogonal).max()
         if not deviation < _TOLERANCE * scale:  # It may be NaN.
             raise error
-        return Similarity(scale, orthogonal, np.asarray(transform[:, 3], dtype=np.float64))
+        translation = np.asarray(transform[:, 3], dtype=np.float64)
+        return Similarity(scale, orthogonal, translation)
 
     def inverse(self) -> Similarity:
         """Return the map back."""
@@ -56,13 +57,15 @@ class Similarity:
 
     def positions(self, means: Array) -> Array:
         """Return positions in the new frame. [N, 3] → [N, 3]"""
-        return self.scale * (means @ self.orthogonal.T) + self.translation
+        turned = means @ self.orthogonal.T  # [N, 3]
+        return self.scale * turned + self.translation
 
     def poses(self, poses: Array) -> Array:
         """Return camera-to-world poses in the new frame. [C, 3, 4] → [C, 3, 4]"""
         rotations = self.orthogonal @ poses[:, :, :3]  # [C, 3, 3]
         positions = self.positions(poses[:, :, 3])  # [C, 3]
-        return np.concatenate([rotations, positions[:, :, None]], axis=2)
+        columns = [rotations, positions[:, :, None]]
+        return np.concatenate(columns, axis=2)
 
     def log_scales(self, scales: Array) -> Array:
         """Return logarithms of standard deviations in the new frame. [N, 3] → [N, 3]"""
@@ -75,8 +78,8 @@ class Similarity:
         """
         from scipy.spatial.transform import Rotation  # It takes half a second to import.
 
-        sign = np.sign(np.linalg.det(self.orthogonal))
-        turn = Rotation.from_matrix(sign * self.orthogonal)
+        determinant = np.linalg.det(self.orthogonal)  # 1, or −1 of a reflection
+        turn = Rotation.from_matrix(np.sign(determinant) * self.orthogonal)
         lengths = np.linalg.norm(quats, axis=1)  # [N]
         is_sound = (lengths > 0) & np.isfinite(lengths)  # Scipy refuses the others.
         before = Rotation.from_quat(quats[is_sound][:, [1, 2, 3, 0]])  # Scipy's quaternions are xyzw.
@@ -90,7 +93,8 @@ class Similarity:
 
         Turned harmonics are sums of harmonics, so that a few directions determine D. [(degree + 1)², (degree + 1)²]
         """
-        directions = np.random.default_rng(0).normal(size=(64, 3))
+        generator = np.random.default_rng(0)
+        directions = generator.normal(size=(64, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         before = spherical_harmonics(directions @ self.orthogonal, degree)
         after = spherical_harmonics(directions, degree)

@@ -38,11 +38,13 @@ class BlenderParser(Blender):
         meta = read_blender(self.data / f"transforms_{split}.json")
         frames = meta["frames"]
         images = blender_images(frames, self.data)
-        height, width = imageio.v2.imread(images[0]).shape[:2]
+        first_image = imageio.v2.imread(images[0])
+        height, width = first_image.shape[:2]
         poses = np.array([frame["transform_matrix"] for frame in frames]).astype(np.float32)  # [V, 4, 4]
         camera_to_worlds = torch.from_numpy(poses[:, :3])
         camera_to_worlds[:, :, 3] *= self.scale_factor
-        focal = 0.5 * width / np.tan(0.5 * float(meta["camera_angle_x"]))  # In px
+        angle = float(meta["camera_angle_x"])  # Horizontal angle of view in radians
+        focal = 0.5 * width / np.tan(0.5 * angle)  # In px
         cameras = Cameras(
             camera_to_worlds=camera_to_worlds,
             fx=focal,
@@ -52,8 +54,10 @@ class BlenderParser(Blender):
             camera_type=CameraType.PERSPECTIVE,
         )
         points = {}
-        if self.config.ply_path is not None:
-            points = _read_ply(self.config.data / self.config.ply_path, torch.eye(4)[:3], self.config.scale_factor)
+        ply_path = self.config.ply_path
+        if ply_path is not None:
+            identity = torch.eye(4)[:3]
+            points = _read_ply(self.config.data / ply_path, identity, self.config.scale_factor)
         side = _BLENDER_SIDE
         return DataparserOutputs(
             image_filenames=images,

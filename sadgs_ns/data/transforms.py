@@ -97,8 +97,9 @@ def mended_name(folder: Path, name: str) -> str:
     """Return the name of a file in a folder as it is there, if it lacks its suffix or was written with backslashes."""
     for start in (name, name.replace("\\", "/")):
         for suffix in ("", *sorted(images.IMAGE_SUFFIXES)):
-            if (folder / f"{start}{suffix}").is_file():
-                return f"{start}{suffix}"
+            candidate = f"{start}{suffix}"
+            if (folder / candidate).is_file():
+                return candidate
     return name
 
 
@@ -193,8 +194,10 @@ def view_of(frame: dict[str, Any], where: str, camera: Camera, image: Path | Non
 
 def camera_of(values: dict[str, Any], model: str, where: str) -> Camera:
     """Return the camera of good values; raise InputError for a distortion that nerfstudio does not support."""
+    width = int(values["w"])
+    height = int(values["h"])
     fx, fy, cx, cy = (values[key] for key in PINHOLE[:4])
-    pinhole = Camera(int(values["w"]), int(values["h"]), fx, fy, cx, cy)
+    pinhole = Camera(width, height, fx, fy, cx, cy)
     k1, k2, k3, k4, p1, p2 = _coefficients(values, where)
     if model == "FISHEYE624":
         if not any((k1, k2, k3, k4, p1, p2)):
