@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,12 +46,12 @@ class Settings:
         stored = read_settings(file, folder)
         if not stored:
             return None
-        settings = cls()
-        for name in vars(settings):
-            value = stored.get(_OPTION_NAMES.get(name, name))
+        known = {}
+        for settings_field in fields(cls):
+            value = stored.get(_OPTION_NAMES.get(settings_field.name, settings_field.name))
             if value is not None:
-                setattr(settings, name, value)
-        return settings
+                known[settings_field.name] = value
+        return cls(**known)
 
     def write(self, file: Path) -> None:
         """Write the settings, so that they are complete or as they were before."""
