@@ -17,7 +17,7 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
     Each one is taken if it fits into the budget that those before it left; of equal priorities the first come first, in
     the order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block
     all others near the cap. Instead of a sort, histograms of the priorities, summed over the processes, find the first
-    Gaussian that does not fit, and then the first of smaller ones; that takes less time, alone, too.
+    Gaussian that does not fit, and then the first of smaller ones; that takes less time, in one process, too.
 
     `growth` is the number of Gaussians that each one of this process would add, ≥ 0, int64 [N], and its `priority` is
     ≥ 0 [N]. `budget` is the number that may be added in all, the same in all processes; ≤ 0 allows none. Gaussians that

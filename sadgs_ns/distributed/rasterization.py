@@ -31,11 +31,11 @@ def rasterize(
     are those of this process, and `world.sizes` must be right. Several processes wait for the exact lengths of tile
     lists, and give `viewmats` no gradient. Raises InputError as `render.rasterization.rasterize`.
 
-    Returns the pictures that this process composited, a single one of everything where it is alone, and the `info` of
-    its Gaussians in all views. With several processes, `info` has `anchor`, which `Exchange.send` returns, and
-    `num_pairs` and `num_pixels` that this process composited.
+    Returns the pictures that this process composited, and the `info` of its Gaussians in all views. A single process
+    composites one picture of everything. With several processes, `info` has `anchor`, which `Exchange.send` returns,
+    and `num_pairs` and `num_pixels` that this process composited.
     """
-    if world.alone:
+    if world.is_single:
         colors, alphas, info = render.rasterize(gaussians, cameras, options)
         return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)

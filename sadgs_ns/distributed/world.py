@@ -45,8 +45,8 @@ class World:
         return self.all(use_triton(self.device))
 
     @property
-    def alone(self) -> bool:
-        """Whether this process holds all Gaussians."""
+    def is_single(self) -> bool:
+        """Whether this is the only process, which holds all Gaussians."""
         return self.num_ranks == 1
 
     @property
@@ -72,7 +72,7 @@ class World:
 
     def gather(self, values: Tensor) -> Tensor:
         """Return the values of all processes, of one length, in the order of their ranks. [n] → [R, n]"""
-        if self.alone:
+        if self.is_single:
             return values[None]
         gathered = values.new_empty(self.num_ranks * len(values))
         dist.all_gather_into_tensor(gathered, values)
@@ -80,22 +80,22 @@ class World:
 
     def sum(self, values: Tensor) -> Tensor:
         """Add up the values of all processes, of one shape, in place, and return them."""
-        if not self.alone:
+        if not self.is_single:
             dist.all_reduce(values)
         return values
 
     def sums(self, *numbers: int) -> list[int]:
         """Return the sums of whole numbers over the processes; one process needs no tensor for them."""
-        return list(numbers) if self.alone else self.sum(torch.tensor(numbers, device=self.device)).tolist()
+        return list(numbers) if self.is_single else self.sum(torch.tensor(numbers, device=self.device)).tolist()
 
     def broadcast(self, values: Tensor, rank: int) -> None:
         """Overwrite a contiguous tensor, of one shape everywhere, with that of one process."""
-        if not self.alone:
+        if not self.is_single:
             dist.broadcast(values, rank)
 
     def least(self, number: float) -> float:
         """Return the least of the numbers of all processes, which may be infinite."""
-        if self.alone:
+        if self.is_single:
             return number
         return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())
 
@@ -108,7 +108,7 @@ class World:
 
         All processes draw all numbers, so that their generators stay alike; on the CPU as `torch.rand((V, total, 2))`.
         """
-        if self.alone:
+        if self.is_single:
             return torch.rand(like.shape, device=like.device)
         kept = []
         for _ in range(len(like)):

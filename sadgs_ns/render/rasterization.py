@@ -68,12 +68,13 @@ def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[
 _REMEDY = "set the option model.backend to auto, of a finished run in its config.yml"
 
 
-def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True) -> str:
+def choose_backend(wanted: BackendName, device: torch.device, single_process: bool = True) -> str:
     """Return which backend draws on a device: "triton", "gsplat" or "torch".
 
     "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. They draw the same, but
     that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton's steps become CUDA graphs, and gsplat
-    cannot draw for several processes. Raise InputError if the backend that is wanted does not draw here.
+    draws only for a `single_process`, which holds all Gaussians. Raise InputError if the backend that is wanted does
+    not draw here.
     """
     chosen: str = wanted
     if wanted == "auto":
@@ -82,7 +83,7 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
         raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): {_REMEDY}.")
     if chosen == "gsplat" and device.type != "cuda":
         raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: {_REMEDY}.")
-    if chosen == "gsplat" and not alone:
+    if chosen == "gsplat" and not single_process:
         problem = "The backend gsplat works on one device only, and this run takes several"
         raise InputError(f"{problem}: take one, or let Triton draw (sadgs-doctor says whether it works).")
     return chosen

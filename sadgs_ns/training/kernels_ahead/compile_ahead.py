@@ -25,7 +25,7 @@ from typing import Any
 from sadgs_ns.events import progress
 
 _FEWEST_CORES = 3  # The run itself keeps two busy
-_LONGEST = 60.0  # Seconds without progress after which the run goes on alone
+_LONGEST = 60.0  # Seconds without progress after which the run no longer waits
 _HERE = Path(__file__).parent
 _CARDS = Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
@@ -110,7 +110,7 @@ def find_kernels() -> None:
     torch.set_num_threads(1)
     stages = Stages(KernelChoice(torch.device("cpu")))
     with triton_switched(True):
-        for stage in (*stages.alone().values(), stages.project, *stages.after_projection().values()):
+        for stage in (*stages.without_projection().values(), stages.project, *stages.after_projection().values()):
             stage()
         Stages(KernelChoice(torch.device("cpu"), size=(4096, 4096))).tile_lists()  # More tiles have longer numbers.
 

@@ -36,7 +36,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
-    alone: bool = True  # Whether one device holds all Gaussians
+    single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
     updates: tuple[tuple[tuple[int, ...], ...], ...] = (((3,), (15, 3), (3,), (1,), (4,), (3,)),)
@@ -66,7 +66,7 @@ class Stages:
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
         self.info: dict[str, Any] = {}  # the rasterizer's, once `project` was called
 
-    def alone(self) -> dict[str, Callable[[], None]]:
+    def without_projection(self) -> dict[str, Callable[[], None]]:
         """Return the stages that need no projection, by their names for users."""
         stages = {
             "the loss": partial(self.loss, torch.uint8),
@@ -86,7 +86,7 @@ class Stages:
                 "tile lists": self.tile_lists,
                 "compositing": partial(self.composite, False),
             }
-        return stages if self.choice.alone else stages | {"what travels between devices": self.exchange}
+        return stages if self.choice.single_process else stages | {"what travels between devices": self.exchange}
 
     def project(self) -> None:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
@@ -116,7 +116,7 @@ class Stages:
 
         factors = torch.zeros((2, sum(map(len, self.choice.updates))), device=self.device)
         # Several processes wait for the lengths of tile lists, which then cannot overflow.
-        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.alone else ()
+        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.single_process else ()
         begin = 0
         nonfinite_flag = torch.zeros(1, device=self.device)
         for shapes in self.choice.updates:
