@@ -40,7 +40,8 @@ def rasterize(
         return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)
     projected = render.project(gaussians, cameras, options, begin_tiles=False)
-    exchange = Exchange(world, projected, share_rows(len(cameras.viewmats), cameras.height, world.num_ranks))
+    bands = share_rows(len(cameras.viewmats), cameras.height, world.num_ranks)
+    exchange = Exchange(world, projected, bands)
     anchor, received = exchange.send(projected, options.absgrad)
     pictures = []
     num_pairs = 0
@@ -48,6 +49,7 @@ def rasterize(
     for band, splats in zip(exchange.bands, received, strict=True):
         colors, alphas, info = render.composite(splats, options)
         pictures.append(Picture(band, colors, alphas))
-        num_pairs = num_pairs + len(info["flatten_ids"])
-        num_pixels = num_pixels + splats.height * splats.width
-    return pictures, projected.info() | {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}
+        num_pairs += len(info["flatten_ids"])
+        num_pixels += splats.height * splats.width
+    of_exchange = {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}
+    return pictures, projected.info() | of_exchange
