@@ -30,26 +30,31 @@ def read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[Vi
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
     called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
     cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
-    if len({cameras[camera_id].fisheye for _, camera_id, _ in poses}) > 1:
+    kinds = {cameras[camera_id].fisheye for _, camera_id, _ in poses}
+    if len(kinds) > 1:
         problem = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
         raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
     rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
-    views = [
-        View(f"{poses_path}: image {name}", called[number], rotation, -rotation.T @ pose[4:], cameras[number])
-        for (name, number, pose), rotation in zip(poses, rotations, strict=True)
-    ]
-    return [name for name, _, _ in poses], views
+    names = []
+    views = []
+    for (name, camera_id, pose), rotation in zip(poses, rotations, strict=True):
+        centre = -rotation.T @ pose[4:]
+        names.append(name)
+        views.append(View(f"{poses_path}: image {name}", called[camera_id], rotation, centre, cameras[camera_id]))
+    return names, views
 
 
 def _camera(camera: colmap.Camera, where: str) -> Camera:
     """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
     model = camera.model
     params = camera.params
-    number = colmap.CAMERA_PARAMETERS.get(camera.model)
+    number = colmap.CAMERA_PARAMETERS.get(model)
     if number is None or model in UNSUPPORTED_CAMERAS:
         problem = f"{where} has the model {model}, which nerfstudio cannot read"
         raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
-    focals = 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
+    focals = 2
+    if model.startswith("SIMPLE") or "RADIAL" in model:
+        focals = 1
     values = {"width": camera.width, "height": camera.height}
     values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}
     check_positive(values, where, list(values))
@@ -57,9 +62,13 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
         raise InputError(f"{where} has {params} instead of {number} finite parameters: run COLMAP's mapper again.")
     fx = params[0]
     fy = params[focals - 1]
-    (cx, cy, *rest) = params[focals:]
-    radial, tangential = (rest[:2], rest[2:]) if model == "OPENCV" else (rest, ())
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), "FISHEYE" in model)
+    cx, cy, *radial = params[focals:]
+    tangential = []
+    if model == "OPENCV":
+        *radial, p1, p2 = radial
+        tangential = [p1, p2]
+    fisheye = "FISHEYE" in model
+    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), fisheye)
 
 
 def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:

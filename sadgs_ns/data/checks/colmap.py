@@ -19,6 +19,7 @@ from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.colmap_views import read_views
 from sadgs_ns.data.layouts import ParserOptions, automatic_options
 from sadgs_ns.data.text import read_text
+from sadgs_ns.data.views import View
 from sadgs_ns.errors import InputError
 
 
@@ -27,12 +28,9 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
     folder = data / options.images_path
     model_folder = data / options.colmap_path
-    if (kind := colmap.model_kind(model_folder)) is None:
-        if not (models := layouts.find_reconstructions(data)):
-            raise InputError(no_layout(data))
-        found = automatic_options(data)
-        problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
-        raise InputError(f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`.")
+    kind = colmap.model_kind(model_folder)
+    if kind is None:
+        raise InputError(_no_model(data, model_folder))
     cameras_path = model_folder / f"cameras.{kind}"
     poses_path = model_folder / f"images.{kind}"
     names, views = read_views(poses_path, cameras_path)
@@ -47,21 +45,46 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
     if open_images:
         factor = yield from _check_factor(folder, names, options)
-        masks = None if options.masks_path is None else data / options.masks_path
-        frames = []
-        for name, camera in zip(names, (view.camera for view in views), strict=True):
-            size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
-            mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
-            frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
+        frames = _frames(data, options, names, views, factor)
         yield from check_images(frames, poses_path, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
-        if (points := colmap.points_file(model_folder)) is None:
+        points = colmap.points_file(model_folder)
+        if points is None:
             yield fault(f"{model_folder} has no points3D file: copy the whole reconstruction, or {random}.")
-        else:
-            remedy = f"run COLMAP's mapper again, or {random}"
-            yield from check_points(colmap.read_points(points), views if sound else [], points, remedy)
+            return
+        remedy = f"run COLMAP's mapper again, or {random}"
+        if not sound:
+            views = []
+        yield from check_points(colmap.read_points(points), views, points, remedy)
+
+
+def _no_model(data: Path, model_folder: Path) -> str:
+    """Return the sentence for a folder without a reconstruction where the options look for one."""
+    models = layouts.find_reconstructions(data)
+    if not models:
+        return no_layout(data)
+    found = automatic_options(data)
+    problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
+    return f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`."
+
+
+def _frames(
+    data: Path, options: ParserOptions, names: Sequence[str], views: Sequence[View], factor: int
+) -> list[images.Frame]:
+    """Return the images, scaled down by a factor, of the views with these names, and their masks."""
+    folder = images.smaller_folder(data / options.images_path, factor)
+    frames = []
+    for name, view in zip(names, views, strict=True):
+        size = (view.camera.width, view.camera.height)
+        size = images.scaled_size(size, factor, options.downscale_rounding_mode)
+        mask = None
+        if options.masks_path is not None:
+            masks = data / options.masks_path
+            mask = images.smaller_folder(masks, factor) / images.mask_name(masks, name)
+        frames.append(images.Frame(folder / name, size, mask))
+    return frames
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
@@ -69,7 +92,8 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
     folder = data / options.images_path
     smaller = images.smaller_folder(folder, options.downscale_factor or 1)
     if not any(os.path.isfile(place / name) for place in (folder, smaller) for name in names):
-        if found := layouts.images_folder(data, options.colmap_path, names):
+        found = layouts.images_folder(data, options.colmap_path, names)
+        if found is not None:
             problem = f"{poses}: image {names[0]} is not in {folder}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found), names)
             raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
@@ -91,7 +115,9 @@ def _words(data: Path, options: ParserOptions, names: Sequence[str]) -> str:
     words = ["--colmap-path", str(options.colmap_path)]
     if options.images_path != ParserOptions.images_path:
         words += ["--images-path", str(options.images_path)]
-    if options.downscale_factor not in (None, images.automatic_factor(data / options.images_path / [*names, ""][0])):
+    first = next(iter(names), "")
+    automatic = images.automatic_factor(data / options.images_path / first)
+    if options.downscale_factor not in (None, automatic):
         words += ["--downscale-factor", str(options.downscale_factor)]
     return shlex.join(words)
 
