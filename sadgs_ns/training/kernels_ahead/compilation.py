@@ -74,6 +74,6 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     finally:
         patience.cancel()
     if failures:
-        why = reason(next(iter(failures.values())))
-        told = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why})"
-        warn(f"{told}: training tries them again, and stops with an error of its own if it cannot do without them.")
+        cause = reason(next(iter(failures.values())))
+        problem = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({cause})"
+        warn(f"{problem}: training tries them again, and stops with an error of its own if it cannot do without them.")
