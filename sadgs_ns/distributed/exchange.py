@@ -53,7 +53,9 @@ class Exchange:
             world.flags_in |= row.pop()
         mine = [index for index, band in enumerate(bands) if band.rank == world.rank]
         self.bands = [bands[index] for index in mine]
-        self.counts = [[row[index] for index in mine] for row in table]
+        self.counts: list[list[int]] = []
+        for row in table:
+            self.counts.append([row[index] for index in mine])
         self._received = [sum(row) for row in self.counts]
         self._sent = [0] * world.num_ranks
         for band, number in zip(bands, table[world.rank], strict=True):
