@@ -64,9 +64,9 @@ def process(options: Process) -> Summary:
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
-    """Print a sentence, and report the event that it is about, with the sentence as the field `told`."""
+    """Print a sentence, and report the event that it is about, with the sentence as a field."""
     print(sentence, flush=True)
-    events.report(event, told=sentence, **fields)
+    events.report(event, sentence=sentence, **fields)
 
 
 def _reporter(progress: Progress) -> Report:

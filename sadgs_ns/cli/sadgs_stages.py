@@ -85,7 +85,7 @@ class _CameraProgress:
         if event == "added":
             self.added = f"{fields['photos']}: "
         elif event in ("panoramas", "aside"):
-            self._line.print(fields["told"])
+            self._line.print(fields["sentence"])
         elif event == "unchanged":
             self.done_before = "; done before"
         elif event == "progress":
@@ -147,7 +147,7 @@ class _TrainingProgress:
         if event == "training begins":
             self.iterations = f"{fields['iterations']:,}"
         elif event == "warning":
-            self._line.print(adapt_remedy(fields["told"], self._work.train_options))
+            self._line.print(adapt_remedy(fields["sentence"], self._work.train_options))
         elif event == "iteration":
             self._work.exporter()  # Meanwhile it imports what export needs.
             status = f"iteration {fields['step']:,} of {self.iterations}"

@@ -233,7 +233,7 @@ class SadgsPipeline(VanillaPipeline):
         model = self.model
         groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
         for index, data in self.views.draw(model.plan.views_per_iteration):
-            if model.world.alone:
+            if model.world.is_single:
                 size = data["image"].shape
             else:
                 size = self.views.sizes[index]  # This process loads only the images that it composites.

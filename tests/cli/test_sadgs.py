@@ -389,7 +389,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             Path(command[2]).mkdir()
             (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
-        on_event("warning", told="masks are not used: end the command with `colmap` to use them.")
+        on_event("warning", sentence="masks are not used: end the command with `colmap` to use them.")
         on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
         (work.results.run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
