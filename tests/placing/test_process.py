@@ -662,6 +662,40 @@ def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp
     assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
 
 
+def test_a_mistake_of_ours_is_not_taken_for_a_damaged_photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    next(draw_photos()).save(tmp_path / "a.jpg")
+    next(draw_photos()).resize((120, 90)).save(tmp_path / "a.png")
+    assert look_into(tmp_path, tmp_path / "out")[0] == ["a.jpg"]
+
+    def mistaken(*others: Any, **named: Any) -> None:
+        raise KeyError("a mistake")
+
+    with monkeypatch.context() as patched, pytest.raises(KeyError, match="a mistake"):
+        patched.setattr(np, "corrcoef", mistaken)
+        look_into(tmp_path, tmp_path / "out")
+    (tmp_path / "masks").mkdir()
+    Image.radial_gradient("L").save(tmp_path / "masks" / "a.png")
+    with monkeypatch.context() as patched, pytest.raises(KeyError, match="a mistake"):
+        patched.setattr(np, "unique", mistaken)
+        look_into(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.hard_case(
+    "a photo and another one of its name, one cut off or of bytes alone", "no copies; it is named when photos are read"
+)
+@pytest.mark.parametrize("size", [0.5, 0.05, 0])
+def test_damaged_photos_are_copies_of_none(tmp_path: Path, size: float):
+    view = next(draw_photos())
+    view.save(tmp_path / "a.jpg")
+    view.resize((120, 90)).save(tmp_path / "a.png")
+    view.resize((100, 75)).save(tmp_path / "a_mask.png")
+    for name in ("a.png", "a_mask.png"):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[: int(size * len(content))] + name.encode())
+    found, masks, _ = look_into(tmp_path, tmp_path / "out")
+    assert found == ["a.jpg", "a.png", "a_mask.png"] and masks == {}
+
+
 @pytest.mark.hard_case("a phone's panorama of a part of the view among the photos", "left out, with a line")
 def test_panoramas_of_a_part_of_the_view_are_left_out(tmp_path: Path):
     exif, view = Image.Exif(), next(draw_photos())
