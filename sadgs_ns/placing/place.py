@@ -35,7 +35,8 @@ def place_photos(options: PlacingOptions, report: Report, say: Say) -> Placed:
     """Find the poses of photos, or of frames of a video, and write a scene for training.
 
     A run that was interrupted is resumed. New photos are added to a finished scene, whose other cameras stay as they
-    are. If fewer than half of the photos register, the scene is written, but it does not count as finished.
+    are. If fewer than half of the photos register, or the cameras are wrong, the scene is written, but it does not
+    count as finished.
 
     Raise InputError if the photos, the folder or the settings cannot be used, OSError if a file cannot be written,
     and RunError if COLMAP fails. The work so far is kept then, and also if an interrupt is raised.

@@ -16,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -25,6 +25,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
 from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
+from sadgs_ns.placing.judgement import judge, measure
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
@@ -188,7 +189,7 @@ def match(
 
 
 def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
-    """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
+    """Estimate cameras and points, and write the best model; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
     new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
@@ -196,13 +197,15 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     search = _Search.of(photos, names, database, model, base)
     best = search.attempt("cameras", {})
     attempts = ""
-    if not search.quality(best)[0]:
+    quality = search.quality(best)
+    if not quality.suffices:
         second = search.attempt("cameras (relaxed)", _RELAXED)
+        second_quality = search.quality(second)
         attempts = (
-            f"A first attempt registered {search.quality(best)[1]}, one with relaxed limits "
-            f"{search.quality(second)[1]}."
+            f"A first attempt registered {quality.registered}, one with relaxed limits {second_quality.registered}."
         )
-        best = max(best, second, key=search.quality)
+        if second_quality > quality:
+            best = second
     before = search.before
     if before is None and best is None:
         raise InputError(_unrelated(names, database))
@@ -221,6 +224,14 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     (partial / "attempts.txt").write_text(attempts)
     partial.rename(model)
     progress("cameras", search.total, search.total)
+
+
+class _Quality(NamedTuple):
+    """Compares models: one that is not wrong first, then one that suffices, then the one with more photos."""
+
+    is_possible: bool  # Whether nothing says that it is wrong
+    suffices: bool  # Whether no other attempt is needed
+    registered: int
 
 
 @dataclass(frozen=True)
@@ -268,7 +279,7 @@ class _Search:
         return options
 
     def attempt(self, stage: str, limits: Mapping[str, float]) -> pycolmap.Reconstruction | None:
-        """Place the cameras with some limits, and return the model with the most photos, or None without any."""
+        """Place the cameras with some limits, and return the best model, or None without any."""
         registered = 0
         if self.before is not None:
             registered = self.before.num_reg_frames()
@@ -288,19 +299,22 @@ class _Search:
             initial_image_pair_callback=lambda: advance(2),
             next_image_callback=lambda: advance(1),
         )
-        largest = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
-        if largest is not None:
-            adjust_robustly(largest, self.fixed_cameras, self.held_frames)
-        return largest
+        candidates = [model for model in models.values() if model.num_points3D() > 0]
+        best = max(candidates, key=self.quality, default=None)
+        if best is not None:
+            adjust_robustly(best, self.fixed_cameras, self.held_frames)
+        return best
 
-    def quality(self, candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
-        """Tell whether an attempt suffices, and how many photos it registered."""
+    def quality(self, candidate: pycolmap.Reconstruction | None) -> _Quality:
+        """Tell whether a model can be right, whether it suffices, and how many photos it registered."""
         if candidate is None:
-            return False, 0
+            return _Quality(False, False, 0)
         count = candidate.num_reg_images()
         cameras = [image.camera for image in candidate.images.values()]
         stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
-        return bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH), count
+        is_enough = bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH)
+        judgement = judge(measure(candidate))
+        return _Quality(not judgement.faults, is_enough and judgement.is_sound, count)
 
 
 def _unrelated(names: Sequence[str], database: Path) -> str:
@@ -310,7 +324,8 @@ def _unrelated(names: Sequence[str], database: Path) -> str:
         poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
     return (
         f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
-        "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
+        "features); take more of them, from different places, with at least two thirds of overlap, sharp, and of a "
+        "scene with texture."
     )
 
 
@@ -336,7 +351,7 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 def summarize(
     names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
 ) -> Summary:
-    """Count the registered photos, and find out why the others are none."""
+    """Count the registered photos, find out why the others are none, and judge the model."""
     registered = registered_photos(model)
     left_out = {}
     with pycolmap.Database.open(database) as opened:
@@ -356,4 +371,8 @@ def summarize(
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()
-    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts)
+    judgement = judge(measure(model))
+    return Summary(
+        len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts, judgement.doubts,
+        judgement.faults,
+    )  # fmt: skip
