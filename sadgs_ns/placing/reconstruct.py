@@ -25,6 +25,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
 from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
+from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
 from sadgs_ns.placing.judgement import judge, measure
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
@@ -59,7 +60,7 @@ FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
 
 def make_model(
     photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None,
-    rigs: Sequence[Sequence[str]],
+    rigs: Sequence[Sequence[str]], alike: Sequence[Sequence[str]] = (),
 ) -> Summary:  # fmt: skip
     """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
@@ -73,6 +74,7 @@ def make_model(
         model: The model's folder. Beside it lie `write_alpha`'s and `write_masks`' files, and what a stopped run left.
         base: An earlier model's folder, to which photos are added; these alone are undistorted, and its cameras stay.
         rigs: The names of the views of each panorama.
+        alike: The names of photos whose groups differ in their folder alone, so that their cameras may be one.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names = sorted(itertools.chain(*groups, *rigs))
@@ -81,7 +83,7 @@ def make_model(
     if not model.exists():
         extract(photos, groups, database, rigs)
         match(names, database, matching, gpu.result(), rigs)
-        place_cameras(photos, names, database, model, base)
+        place_cameras(photos, names, database, model, base, alike)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
     made = pycolmap.Reconstruction(model)
     undistorted = model.with_name("undistorted")
@@ -188,11 +190,15 @@ def match(
     progress(stage, len(pairs), len(pairs))
 
 
-def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
+def place_cameras(
+    photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None,
+    alike: Sequence[Sequence[str]] = (),
+) -> None:  # fmt: skip
     """Estimate cameras and points, and write the best model; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
-    new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
+    new photos, and photos that did not register before are tried again. Cameras of photos that are `alike`, as of
+    `make_model`, are joined if they are one and the model suffices. Raise InputError if no photos could be related.
     """
     search = _Search.of(photos, names, database, model, base)
     best = search.attempt("cameras", {})
@@ -206,6 +212,7 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
         )
         if second_quality > quality:
             best = second
+            quality = second_quality
     before = search.before
     if before is None and best is None:
         raise InputError(_unrelated(names, database))
@@ -214,6 +221,12 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
             "none of the photos that were added could be related to the others: take some that share two thirds of "
             "what they show with each other and with those that are there, or take these out of the folder again."
         )
+    joined: dict[int, int] = {}
+    if quality.suffices:
+        joined = same_cameras(best, alike, search.fixed_cameras)
+    if joined:
+        best = join_cameras(best, joined)
+        adjust_robustly(best, search.fixed_cameras, search.held_frames)
     for frame_id in search.held_frames:  # COLMAP rounds poses that it holds fixed.
         assert before is not None
         best.frames[frame_id].rig_from_world = before.frames[frame_id].rig_from_world
@@ -222,6 +235,8 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     best.write(partial)
     check_written(partial, best)
     (partial / "attempts.txt").write_text(attempts)
+    if joined:  # Photos that are added later find their folder's camera in the database.
+        join_in_database(database, joined)
     partial.rename(model)
     progress("cameras", search.total, search.total)
 
