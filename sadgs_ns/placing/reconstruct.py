@@ -23,8 +23,9 @@ import pycolmap
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
-from sadgs_ns.placing.adjustment import adjust_robustly
+from sadgs_ns.placing.adjustment import adjust_robustly, refine
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
+from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
 from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
 from sadgs_ns.placing.judgement import judge, measure
 from sadgs_ns.placing.panoramas import rotations
@@ -52,9 +53,9 @@ _PLACING = {"ba_local_num_images": 2, "init_min_tri_angle": 8.0}
 own are 6 and 16; of 200 frames of a room it looked 10 s for two with 16 and then took two with 8."""
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
-_ENOUGH, _MOST_STRETCH = 0.9, 0.05
+_ENOUGH, _MOST_STRETCH = 0.9, 0.1
 """Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
-of lenses differ less, those of models that went wrong in the beginning more."""
+of lenses and of resized photos differ less, those of models that went wrong more."""
 FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
 
 
@@ -305,19 +306,31 @@ class _Search:
             progress(stage, registered, self.total)
 
         advance(0)
-        models = pycolmap.incremental_mapping(
-            self.database,
-            self.photos,
-            empty_folder(self.models),
-            self.options(limits),
-            input_path=self.base or "",
-            initial_image_pair_callback=lambda: advance(2),
-            next_image_callback=lambda: advance(1),
-        )
+        options = self.options(limits)
+        if self.before is None:
+            simplification = few_parameters(self.database, self.fixed_cameras)
+        else:
+            simplification = contextlib.nullcontext()  # The earlier model's cameras have all parameters.
+        with simplification:
+            models = pycolmap.incremental_mapping(
+                self.database,
+                self.photos,
+                empty_folder(self.models),
+                options,
+                input_path=self.base or "",
+                initial_image_pair_callback=lambda: advance(2),
+                next_image_callback=lambda: advance(1),
+            )
         candidates = [model for model in models.values() if model.num_points3D() > 0]
         best = max(candidates, key=self.quality, default=None)
-        if best is not None:
-            adjust_robustly(best, self.fixed_cameras, self.held_frames)
+        if best is None:
+            return None
+        if self.before is None:
+            free_all_parameters(best)
+            refine(best, self.database, options)
+        adjust_robustly(best, self.fixed_cameras, self.held_frames)
+        if best.num_points3D() == 0:  # None fits with all parameters.
+            return None
         return best
 
     def quality(self, candidate: pycolmap.Reconstruction | None) -> _Quality:
