@@ -38,7 +38,7 @@ class Settings:
     views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
     files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
     trained: str | None = None  # The sentence of a finished training
-    few: str | None = None  # The sentence on the registered photos, if they are fewer than half of all
+    few: str | None = None  # The sentence on the registered photos, if they are few or their cameras are wrong
 
     @classmethod
     def read(cls, file: Path, folder: Path) -> Settings | None:

@@ -47,7 +47,9 @@ def place_cameras(work: PhotosToSplat, line: StatusLine) -> str:
         work.results.write_settings()
         if not work.options.anyway:
             line.update(found)
-            raise RunError(_explain_few(found, summary, command))
+            raise RunError(_explain_poor(found, summary, command))
+        for reason in summary.faults:
+            line.print(f"warning: the cameras are wrong, because {reason}.")
     if summary.registered < summary.photos:
         found += ", log/cameras.txt tells of the others"
     return found + progress.done_before
@@ -63,14 +65,18 @@ def _mention_cameras_above(source: Path, line: StatusLine) -> None:
             line.print(f"{cameras} is not used: `sadgs {shlex.quote(str(source.parent))}` takes these cameras.")
 
 
-def _explain_few(found: str, summary: Summary, command: list[str]) -> str:
-    """Return the sentence on too few registered photos."""
-    remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
+def _explain_poor(found: str, summary: Summary, command: list[str]) -> str:
+    """Return the sentence on cameras that are wrong, or of too few photos."""
+    if summary.faults:
+        problem = f"{found}, but the cameras are wrong, because {'; and '.join(summary.faults)}; "
+        remedies = "begin another --output with such photos; "
+    else:
+        problem = f"only {found}, so the splat would show only what these saw: "
+        remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
     if summary.matching != "exhaustive":
         exhaustive = shlex.join([*command, "--matching", "exhaustive"])
         remedies += f"or compare more pairs of them with `{exhaustive}`, and run this command again; "
-    remedies += "or go on with these with --anyway."
-    return f"only {found}, so the splat would show only what these saw: {remedies}"
+    return f"{problem}{remedies}or go on with these with --anyway."
 
 
 class _CameraProgress:

@@ -29,8 +29,10 @@ from sadgs_ns.cli.sadgs import main
 from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
+from sadgs_ns.errors import RunError
 from sadgs_ns.files import locked
 from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.stamps import photo_stamps
 
 TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
@@ -310,6 +312,43 @@ def test_the_command_that_compares_more_pairs_keeps_the_size(
     monkeypatch.setattr(PhotosToSplat, "call", lambda *others: found)
     assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply", "--max-size", "400"]) == 1
     assert "/scene --max-size 400 --matching exhaustive`, and run" in capsys.readouterr().err
+
+
+@pytest.mark.hard_case(
+    "the cameras that `sadgs` found are wrong", "it ends before training with the reason; `--anyway` goes on"
+)
+def test_wrong_cameras_end_it_until_it_shall_go_on_anyway(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    summary = Summary(10, 10, 100, 0.5, {}, "exhaustive", faults=["they see too much: zoom in", "they are flat: move"])
+    called: list[str] = []
+
+    def call(work: PhotosToSplat, worker: object, line: object, on_event: Any, command: list[str], *others: Any) -> Any:
+        called.append(command[0])
+        if command[0] != "sadgs-process":
+            raise RunError("stopped here")
+        settings = Scene(work.process).settings
+        settings.files = photo_stamps(photos, settings.photos)
+        (work.results.scene / "work").mkdir(parents=True)
+        settings.write(work.results.scene / "work" / "settings.json")
+        (work.results.scene / "transforms.json").write_text('{"frames": []}')
+        return dataclasses.asdict(summary)
+
+    monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
+    monkeypatch.setattr(PhotosToSplat, "call", call)
+    command = [str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 1
+    told = "sadgs: 10 of 10 photos registered, but the cameras are wrong, because they see too much: zoom in; and they "
+    remedies = "are flat: move; begin another --output with such photos; or go on with these with --anyway.\n"
+    assert capsys.readouterr().err == told + remedies
+    assert called == ["sadgs-process"] and (tmp_path / "out" / "scene" / "transforms.json").exists()
+    assert main([*command, "--anyway"]) == 1
+    printed = capsys.readouterr()
+    assert "10 of 10 photos registered; done before" in printed.out and printed.err == "sadgs: stopped here\n"
+    assert called == ["sadgs-process", "ns-train"]
+    assert main([str(photos), "-o", str(tmp_path / "other"), "--formats", "ply", "--anyway"]) == 1
+    assert called[2:] == ["sadgs-process", "ns-train"]
+    assert "warning: the cameras are wrong, because they are flat: move." in capsys.readouterr().out
 
 
 @pytest.mark.hard_case(
