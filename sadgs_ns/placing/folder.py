@@ -19,6 +19,7 @@ from sadgs_ns.data.layouts import automatic_options
 from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings
+from sadgs_ns.placing.bands import other_bands
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
@@ -129,6 +130,9 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     found["copies of others"] = copies = _copies(folder, photos, known)
     found["panoramas of a part of the view"] = swept = [p for p in photos if p not in known and _is_swept(folder / p)]
     photos = [name for name in photos if name not in {*copies, *swept}]
+    bands = other_bands(folder, photos, known)
+    found.update(bands)
+    photos = sorted({*photos}.difference(*bands.values()))
     for name in photos:
         stems[_stem(name)].append(name)
     for name in maps:
