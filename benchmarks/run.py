@@ -124,7 +124,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     if devices > 1:
         if not processes.is_rank_zero():
             return {}
-        trainer = alone(job, root, work, trainer.checkpoint_dir)
+        trainer = load_in_one_process(job, root, work, trainer.checkpoint_dir)
     record = {"devices": devices, **measure(trainer, timer, seconds)}
     if curve is not None:
         end = point(record["iterations"], timer.seconds, record, record["gaussians"])
@@ -162,7 +162,7 @@ def set_up(job: Job, root: Path, work: Path, devices: int, seconds: dict[str, fl
             model_class.populate_modules = populate
     seconds["setup_seconds"] -= seconds["initialization_seconds"]
     world = getattr(trainer, "world", None)
-    if devices > 1 and (world is None or world.alone):
+    if devices > 1 and (world is None or world.is_single):
         raise ValueError(
             f"row {job.row.label!r} on {job.scene.name!r} trains on one device, since its steps have few pixels or its "
             "method knows one only: measure it with one GPU, or set share_always to true."
@@ -273,7 +273,7 @@ def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
     }
 
 
-def alone(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
+def load_in_one_process(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
     """Return a trainer in which this process has all that several trained and wrote to a folder of checkpoints."""
     for name in list(os.environ):
         if name in ("RANK", "WORLD_SIZE") or name.startswith(("LOCAL_", "GROUP_")):

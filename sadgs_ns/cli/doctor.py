@@ -60,23 +60,41 @@ def check_machine() -> Iterator[Finding]:
     if has_gpu:
         yield from _check_cuda()
     else:
-        built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
-        why = "".join(f" ({re.split('[.] (?=[A-Z(])', str(warning.message))[0]})" for warning in caught)
-        yield warning(
-            f"torch is {built} and sees no GPU{why}: training runs on {os.cpu_count()} CPU cores, which is for small "
-            "scenes and tests; for more, install a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and a "
-            "torch for its CUDA."
-        )
-    if (weights := Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)).is_file():
+        built = "built without CUDA"
+        if torch.version.cuda:
+            built = f"built for CUDA {torch.version.cuda}"
+        causes = "".join(f" ({_first_sentence(str(message.message))})" for message in caught)
+        problem = f"torch is {built} and sees no GPU{causes}"
+        consequence = f"training runs on {os.cpu_count()} CPU cores, which is for small scenes and tests"
+        driver = "a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12"
+        yield warning(f"{problem}: {consequence}; for more, install {driver}, and a torch for its CUDA.")
+    weights = Path(torch.hub.get_dir(), "checkpoints", _LPIPS_FILE)
+    if weights.is_file():
         yield note(f"LPIPS with AlexNet has its weights: {weights}.")
     else:
         remedy = f"the first `ns-eval` downloads them to {weights}, or leaves it out"
         yield warning(f"LPIPS with AlexNet has no weights: {remedy}.")
     for program, names, use in _NEEDED:
-        if found := next(filter(None, (shutil.which(n) or ctypes.util.find_library(n) for n in names.split())), None):
+        found = _find_program(names.split())
+        if found is not None:
             yield note(f"{program}: {found}.")
-        else:  # The check of gsplat says whether nvcc is needed.
-            yield (note if program == "nvcc" else warning)(f"{program} is missing: {use}.")
+        elif program == "nvcc":  # The check of gsplat says whether it is needed.
+            yield note(f"{program} is missing: {use}.")
+        else:
+            yield warning(f"{program} is missing: {use}.")
+
+
+def _first_sentence(text: str) -> str:
+    return re.split("[.] (?=[A-Z(])", text)[0]
+
+
+def _find_program(names: Sequence[str]) -> str | None:
+    """Return the first program or library with one of these names; None if there is none."""
+    for name in names:
+        found = shutil.which(name) or ctypes.util.find_library(name)
+        if found:
+            return found
+    return None
 
 
 def _load_torchvision() -> None:
@@ -84,7 +102,10 @@ def _load_torchvision() -> None:
     import torch
 
     spec = importlib.util.find_spec("torchvision")
-    libraries = [] if spec is None or spec.origin is None else sorted(Path(spec.origin).parent.glob("_C.*"))
+    libraries = []
+    if spec is not None and spec.origin is not None:
+        folder = Path(spec.origin).parent
+        libraries = sorted(folder.glob("_C.*"))
     if libraries:
         torch.ops.load_library(libraries[0])
     else:
@@ -98,16 +119,16 @@ def _check_cuda() -> Iterator[Finding]:
 
     device = torch.device("cuda")
     name = torch.cuda.get_device_name(device)
-    (free, total) = torch.cuda.mem_get_info(device)
+    free, total = torch.cuda.mem_get_info(device)
     capability = torch.cuda.get_device_capability(device)
     built = torch.cuda.get_arch_list()
-    driver = re.search(r"\d{3}\.[\d.]+", _DRIVER_FILE.read_text()) if _DRIVER_FILE.exists() else None
     sm = "sm_{}{}".format(*capability)
     yield note(f"GPU: {name}, {sm}, {free / 1e9:.1f} of {total / 1e9:.1f} GB free, CUDA {torch.version.cuda}.")
-    yield note(f"NVIDIA driver: {driver[0] if driver else 'unknown'}.")
+    yield note(f"NVIDIA driver: {_driver_version()}.")
     if not _runs(built, capability):
-        newer = "torch 2.9 or newer for CUDA 12.8 or newer, which RTX 50 (sm_120) needs"
-        remedy = newer if capability >= (7, 5) else "a torch for CUDA 12.6, the last with code for cards before sm_75"
+        remedy = "torch 2.9 or newer for CUDA 12.8 or newer, which RTX 50 (sm_120) needs"
+        if capability < (7, 5):
+            remedy = "a torch for CUDA 12.6, the last with code for cards before sm_75"
         yield fault(f"This torch has code for {', '.join(built)}, but none for this GPU, {sm}: install {remedy}.")
         return
     with warnings.catch_warnings(record=True) as caught:
@@ -118,10 +139,10 @@ def _check_cuda() -> Iterator[Finding]:
     elif compiles:
         yield note("Triton compiles its kernels here.")
     else:
-        why = "; ".join(str(warning.message) for warning in caught) or "Triton is not installed or failed before"
+        causes = "; ".join(str(message.message) for message in caught) or "Triton is not installed or failed before"
         needed = ".".join(map(str, kernels.OLDEST_TRITON))
-        told = f"Training will take twice as long ({why})"
-        yield warning(f"{told}: install a torch whose Triton is {needed} or newer, a C compiler and Python's headers.")
+        remedy = f"install a torch whose Triton is {needed} or newer, a C compiler and Python's headers"
+        yield warning(f"Training will take twice as long ({causes}): {remedy}.")
     try:
         from sadgs_ns import gsplat_compat
 
@@ -133,10 +154,26 @@ def _check_cuda() -> Iterator[Finding]:
         yield note("gsplat has its CUDA kernels.")
 
 
+def _driver_version() -> str:
+    if not _DRIVER_FILE.exists():
+        return "unknown"
+    found = re.search(r"\d{3}\.[\d.]+", _DRIVER_FILE.read_text())
+    if found is None:
+        return "unknown"
+    return found[0]
+
+
 def _runs(built: Sequence[str], capability: tuple[int, int]) -> bool:
     """Return whether code for architectures, such as sm_80 or compute_90, which is PTX, runs on a GPU's capability."""
-    known = [(kind, (int(major), int(minor))) for kind, major, minor in re.findall(r"(\w+)_(\d+)(\d)", " ".join(built))]
-    return not known or any(v <= capability and (kind == "compute" or v[0] == capability[0]) for kind, v in known)
+    known = re.findall(r"(\w+)_(\d+)(\d)", " ".join(built))
+    if not known:
+        return True
+    for kind, major, minor in known:
+        architecture = (int(major), int(minor))
+        is_of_same_major = architecture[0] == capability[0]
+        if architecture <= capability and (kind == "compute" or is_of_same_major):
+            return True
+    return False
 
 
 @dataclass
@@ -153,10 +190,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(", ".join(f"{package} {number}" for package, number in versions().items()))
     print(f"note: Free disk space here: {free_space(Path())}.", flush=True)
     failed = False
-    for check in (check_machine, lambda: [] if data is None else check_data(data)):
-        for finding in check():
-            print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
-            failed |= finding.severity == "error"
-    if data is not None and not failed:
+    for finding in _check(data):
+        print(f"{finding.severity}: {finding.sentence}", flush=True)  # The next one may take seconds.
+        if finding.severity == "error":
+            failed = True
+    if failed:
+        return 1
+    if data is not None:
         print(f"Next: ns-train sadgs --data {shlex.quote(str(data))}")
-    return int(failed)
+    return 0
+
+
+def _check(data: Path | None) -> Iterator[Finding]:
+    yield from check_machine()
+    if data is not None:
+        yield from check_data(data)

@@ -74,7 +74,10 @@ def write_gaussians(
     parameters' frame to the file's. Raises as `of_parameters` and `formats.write`.
     """
     gaussians = of_parameters(_arrays(params))
-    sound = (gaussians if similarity is None else gaussians.moved(similarity)).finite()
+    moved = gaussians
+    if similarity is not None:
+        moved = gaussians.moved(similarity)
+    sound = moved.finite()
     formats.write(path, sound, context)
     if len(sound) < len(gaussians):
         print(f"{path}: dropped {len(gaussians) - len(sound)} of {len(gaussians)} Gaussians that are not finite")
@@ -104,11 +107,13 @@ def export(options: Export) -> int:
 
     cleaning = Cleaning(options.min_views, options.max_extent, options.crop, options.dust)
     check_options(cleaning)
-    similarity = from_data(folder / TRANSFORMS_NAME).inverse() if options.frame == "colmap" else None
+    similarity = None
+    if options.frame == "colmap":
+        similarity = from_data(folder / TRANSFORMS_NAME).inverse()
     params, drawing = read_checkpoint(options.run)
     if similarity is not None:
         _check_steps(similarity, float(params["scales"].median()))
-    cameras = start = None
+    cameras = None
     if is_page or is_mesh or cleaning.needs_views:
         from sadgs_ns.data.run_cameras import read_cameras
 
@@ -118,13 +123,23 @@ def export(options: Export) -> int:
         from sadgs_ns.cli.meshing import write_mesh
 
         return write_mesh(options.output, params, cameras, similarity, options.voxel_size, drawing)
+    start = None
     if is_page and cameras is not None:
         pose = cameras.camera_to_worlds[0].double().numpy()
         focal = float(cameras.Ks[0, 0, 0])
         start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
-    up = np.eye(3)[2] if similarity is None else similarity.orthogonal[:, 2]
-    x, y, z = (np.eye(3)[np.abs(up).argmax()] * np.sign(up)).tolist()  # The nearest axis of the file's frame
-    return write_gaussians(options.output, params, Context((x, y, z), start), similarity)
+    context = Context(_axis_up(similarity), start)
+    return write_gaussians(options.output, params, context, similarity)
+
+
+def _axis_up(similarity: Similarity | None) -> tuple[float, float, float]:
+    """Return the axis of the file's frame that is nearest to up, given the map from nerfstudio's frame to it."""
+    up = np.array([0.0, 0.0, 1.0])
+    if similarity is not None:
+        up = similarity.orthogonal[:, 2]
+    nearest = np.eye(3)[np.abs(up).argmax()]
+    x, y, z = (nearest * np.sign(up)).tolist()
+    return x, y, z
 
 
 def _check(options: Export) -> None:
@@ -141,9 +156,12 @@ def _check(options: Export) -> None:
 def _check_steps(similarity: Similarity, log_size: float) -> None:
     """Raise InputError if float32, in which files hold positions, has larger steps in a frame than Gaussians' size."""
     place = float(np.abs(similarity.translation).max())
-    if (step := float(np.spacing(np.float32(place)))) > similarity.scale * math.exp(log_size):
-        told = f"--frame colmap puts the splat {place:.3g} units from the origin, where float32 has steps of {step:.2g}"
-        raise InputError(f"{told}: leave it out, and place the file by the transform in the run's {TRANSFORMS_NAME}.")
+    step = float(np.spacing(np.float32(place)))
+    if step > similarity.scale * math.exp(log_size):
+        distance = f"{place:.3g} units from the origin"
+        problem = f"--frame colmap puts the splat {distance}, where float32 has steps of {step:.2g}"
+        remedy = f"leave it out, and place the file by the transform in the run's {TRANSFORMS_NAME}"
+        raise InputError(f"{problem}: {remedy}.")
 
 
 def _cleaned(
@@ -160,7 +178,9 @@ def _cleaned(
 
     if cleaning == Cleaning():
         return params
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device("cpu")
+    if torch.cuda.is_available():
+        device = torch.device("cuda")
     seen = None
     shapes = {name: params[name].to(device) for name in ("means", "quats", "scales", "opacities")}
     if cleaning.needs_views and cameras is not None:
@@ -183,12 +203,18 @@ def _checkpoint_of(run: Path) -> Path:
     """Return the latest checkpoint of a run, which its folder, its `config.yml` or a checkpoint itself names."""
     if run.suffix == ".ckpt" and run.is_file():
         return run
-    folder = run.parent if run.is_file() else run
-    found = [path for depth in ("", "*/") for path in folder.glob(f"{depth}step-*.ckpt") if path.stem[5:].isdecimal()]
+    folder = run
+    if run.is_file():
+        folder = run.parent
+    files = [*folder.glob("step-*.ckpt"), *folder.glob("*/step-*.ckpt")]
+    steps = {path: path.stem.removeprefix("step-") for path in files}
+    found = {path: int(step) for path, step in steps.items() if step.isdecimal()}
     if not found:
-        what = "does not exist" if not run.exists() else "holds no checkpoint"
-        raise InputError(f"{run} {what}: give the folder of a run, its config.yml or a checkpoint step-*.ckpt.")
-    return max(found, key=lambda path: int(path.stem[5:]))
+        problem = "holds no checkpoint"
+        if not run.exists():
+            problem = "does not exist"
+        raise InputError(f"{run} {problem}: give the folder of a run, its config.yml or a checkpoint step-*.ckpt.")
+    return max(found, key=lambda path: found[path])
 
 
 def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
@@ -204,12 +230,15 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     from sadgs_ns.training.run import checkpoints
 
     checkpoint = _checkpoint_of(run)
-    folder, single = (None, checkpoint) if checkpoint == run else (checkpoint.parent, None)
-    chosen = checkpoints.read_chosen(folder, None, single, _REMEDY, mmap=True)
+    if checkpoint == run:
+        chosen = checkpoints.read_chosen(None, None, checkpoint, _REMEDY, mmap=True)
+    else:
+        chosen = checkpoints.read_chosen(checkpoint.parent, None, None, _REMEDY, mmap=True)
     assert chosen is not None
-    checkpoint = chosen[0]
-    loaded = chosen[1]["pipeline"]
-    loaded = loaded if isinstance(loaded, dict) else {}
+    checkpoint, content = chosen
+    loaded = content["pipeline"]
+    if not isinstance(loaded, dict):
+        loaded = {}
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
@@ -222,10 +251,13 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
         of_parameters(_arrays(params))
     except ValueError as error:
         raise InputError(f"{checkpoint} holds no Gaussians that can be exported ({error}): {_REMEDY}.") from error
+    plan = {}
     state = loaded.get("_extra_state")
-    plan = state.get("plan", {}) if isinstance(state, dict) else {}
-    defaults = {"near_plane": RenderOptions.near_plane, "max_off_axis": _MAX_OFF_AXIS}
-    return params, RenderOptions(**{name: plan.get(name, value) for name, value in defaults.items()})
+    if isinstance(state, dict):
+        plan = state.get("plan", {})
+    near_plane = plan.get("near_plane", RenderOptions.near_plane)
+    max_off_axis = plan.get("max_off_axis", _MAX_OFF_AXIS)
+    return params, RenderOptions(near_plane=near_plane, max_off_axis=max_off_axis)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -236,7 +268,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
         return 2
-    what = "triangles fused from rendered depth" if format_of(options.output) == MESH else "Gaussians"
-    told = f"{count:,} {what}, {options.output.stat().st_size / 1e6:,.1f} MB, in the frame of {options.frame}"
-    print(f"{options.output}: {told}")
+    parts = "Gaussians"
+    if format_of(options.output) == MESH:
+        parts = "triangles fused from rendered depth"
+    megabytes = options.output.stat().st_size / 1e6
+    print(f"{options.output}: {count:,} {parts}, {megabytes:,.1f} MB, in the frame of {options.frame}")
     return 0

@@ -106,12 +106,16 @@ def get_view(pipeline: SadgsPipeline, index: int, split: Split = "train") -> Vie
     """Return a view by its number in the split, from 0; raise InputError if there is none."""
     datamanager = pipeline.datamanager
     is_training = split == "train"
-    dataset = datamanager.train_dataset if is_training else datamanager.eval_dataset
+    dataset = datamanager.eval_dataset
+    if is_training:
+        dataset = datamanager.train_dataset
     if not 0 <= index < len(dataset):
         raise InputError(f"--view {index}: the {split} split has views 0 to {len(dataset) - 1}.")
     # The images come before the camera, because undistorting them changes the intrinsics.
-    images = datamanager.cached_train if is_training else datamanager.cached_eval
-    data = images[index]
+    if is_training:
+        data = datamanager.cached_train[index]
+    else:
+        data = datamanager.cached_eval[index]
     camera = pipeline.model.pinhole(dataset.cameras[index : index + 1])
     if is_training:  # Poses may be learned.
         viewmats = pipeline.views.viewmat(index)[None]
@@ -222,12 +226,16 @@ def view_panels(pipeline: SadgsPipeline, view: View, statistics: dict[str, Tenso
     def panel(title: str, picture: Picture, scale: Scale) -> Panel:
         return Panel(f"{view.name}: {title}", picture, scale)
 
+    ellipses_title = "the structure tensor, its inverse as ellipses"
+    eta_title = "η of the Gaussians, largest of their observations; over 1 violates"
+    children_title = f"{num_split:,} {of_all} would split, {num_added:,} more"
+    low_title = f"{num_low:,} {of_all} are consistently low (η < 0.1)"
     return {
-        "ellipses": panel("the structure tensor, its inverse as ellipses", _ellipses(pipeline, view), PERIOD),
+        "ellipses": panel(ellipses_title, _ellipses(pipeline, view), PERIOD),
         "wavelength": panel("local wavelength", PERIOD(period), PERIOD),
-        "eta": panel("η of the Gaussians, largest of their observations; over 1 violates", ETA(eta), ETA),
-        "children": panel(f"{num_split:,} {of_all} would split, {num_added:,} more", CHILDREN(children), CHILDREN),
-        "low": panel(f"{num_low:,} {of_all} are consistently low (η < 0.1)", LOW(low), LOW),
+        "eta": panel(eta_title, ETA(eta), ETA),
+        "children": panel(children_title, CHILDREN(children), CHILDREN),
+        "low": panel(low_title, LOW(low), LOW),
     }
 
 
@@ -297,7 +305,9 @@ def inspect_run(
 
     folder = output
     if folder is None:
-        run_folder = config if config.is_dir() else config.parent
+        run_folder = config
+        if not config.is_dir():
+            run_folder = config.parent
         folder = run_folder / "inspect"
     files = []
     for name, panels in pictures.items():

@@ -43,7 +43,9 @@ def write_mesh(
     number = len(cameras.sizes)
     if not number:
         raise InputError("The capture has no training views to fuse the depth of: give another with --data.")
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = torch.device("cpu")
+    if torch.cuda.is_available():
+        device = torch.device("cuda")
     sound = torch.stack([value.flatten(1).isfinite().all(dim=1) for value in params.values()]).all(dim=0)  # [N]
     params = {name: value[sound].to(device) for name, value in params.items()}
     if voxel_size is None:
@@ -58,8 +60,10 @@ def write_mesh(
     if not len(found.triangles):
         problem = f"No surface came out of {number} training views with voxels of {voxel_size:.3g}"
         raise InputError(f"{problem}: take fewer Gaussians away, or leave --voxel-size out.")
+    if similarity is not None:
+        found = mesh.moved(found, similarity)
     with atomic_path(path) as partial, partial.open("wb") as file:
-        mesh.write(file, found if similarity is None else mesh.moved(found, similarity))
+        mesh.write(file, found)
     return len(found.triangles)
 
 
@@ -87,7 +91,9 @@ def render_depths(
     first = params["features_dc"]
     rest = params["features_rest"]
     degree = round((1 + rest.shape[1]) ** 0.5) - 1
-    colors = (first, rest) if degree else (0.5 + DEGREE_0 * first).clamp_min(0.0)
+    colors = (first, rest)
+    if degree == 0:
+        colors = (0.5 + DEGREE_0 * first).clamp_min(0.0)
     gaussians = Gaussians(params["means"], params["quats"], scales, opacities, colors)
     options = replace(drawing, sh_degree=degree or None, expected_depth=True)
     for index in indices:

@@ -58,15 +58,17 @@ def process(options: Process) -> Summary:
     finally:
         progress.stop()
     print(placed.summary)
+    for doubt in placed.summary.doubts:
+        _say("aside", f"warning: the cameras may be wrong, because {doubt}.")
     for sentence in placed.unused:
         _say("aside", sentence)
     return placed.summary
 
 
 def _say(event: str, sentence: str, **fields: str) -> None:
-    """Print a sentence, and report the event that it is about, with the sentence as the field `told`."""
+    """Print a sentence, and report the event that it is about, with the sentence as a field."""
     print(sentence, flush=True)
-    events.report(event, told=sentence, **fields)
+    events.report(event, sentence=sentence, **fields)
 
 
 def _reporter(progress: Progress) -> Report:
@@ -92,7 +94,7 @@ def _reporter(progress: Progress) -> Report:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Make a scene and return the exit code, which is 1 also if fewer than half of the photos registered."""
+    """Make a scene and return the exit code, which is 1 also if few photos registered or the cameras are wrong."""
     options = parse(Process, "sadgs-process", argv)
     return exit_code("sadgs-process", options.out, lambda: _run(options))
 
@@ -103,12 +105,18 @@ def _run(options: Process) -> int:
     if not summary.is_poor:
         print(f"\nCheck machine and data before a long run:  sadgs-doctor {out}\nTrain:  ns-train sadgs --data {out}")
         return 0
+    print(_explain_poor(summary, out), file=sys.stderr)
+    return 1
+
+
+def _explain_poor(summary: Summary, out: str) -> str:
+    """Return the sentences on cameras that are wrong, or of too few photos, in a folder whose name is quoted."""
     remedy = "another folder with more photos between those that did not register, with two thirds of overlap"
+    if summary.faults:
+        problem = f"the cameras in {out} are wrong, because {'; and '.join(summary.faults)}."
+        remedy = "another folder with such photos"
+    else:
+        problem = f"{out} shows only what {summary.registered} of {summary.photos} photos saw."
     if summary.matching != "exhaustive":
         remedy = f"the same command with --matching exhaustive, which uses the features found so far; or {remedy}"
-    print(
-        f"warning: {options.out} shows only what {summary.registered} of {summary.photos} photos saw. Try {remedy}. "
-        f"This trains on what is there: ns-train sadgs --data {out}",
-        file=sys.stderr,
-    )
-    return 1
+    return f"warning: {problem} Try {remedy}. This trains on what is there: ns-train sadgs --data {out}"

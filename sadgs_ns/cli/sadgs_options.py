@@ -45,7 +45,9 @@ class Sadgs:
         tyro.conf.arg(metavar="A,B", help=f"Formats to export, of {', '.join(FORMAT_NAMES)}; by default html,ply."),
     ] = None
     anyway: bool = False
-    """Continue even if fewer than half of the photos registered."""
+    """Continue even if fewer than half of the photos registered, or their cameras are wrong."""
+    measure: bool = False
+    """Hold every eighth photo out of training, and print in the end how well run and file show these."""
     profile: bool = False
     """Also print where the time went as a table."""
 

@@ -1,4 +1,4 @@
-"""The stages of `sadgs`: cameras, training and export.
+"""The stages of `sadgs`: cameras, training, export and, if asked for, measures.
 
 Each sees in the folder whether it was done before, shows on its line how far it is, and returns the last sentence.
 """
@@ -22,6 +22,7 @@ from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing.plan import Summary
 
 _PLACING = "sadgs_ns.cli.process:process"
+_MEASURING = "sadgs_ns.cli.measuring:measure"
 
 
 def place_cameras(work: PhotosToSplat, line: StatusLine) -> str:
@@ -47,7 +48,9 @@ def place_cameras(work: PhotosToSplat, line: StatusLine) -> str:
         work.results.write_settings()
         if not work.options.anyway:
             line.update(found)
-            raise RunError(_explain_few(found, summary, command))
+            raise RunError(_explain_poor(found, summary, command))
+        for reason in summary.faults:
+            line.print(f"warning: the cameras are wrong, because {reason}.")
     if summary.registered < summary.photos:
         found += ", log/cameras.txt tells of the others"
     return found + progress.done_before
@@ -63,14 +66,18 @@ def _mention_cameras_above(source: Path, line: StatusLine) -> None:
             line.print(f"{cameras} is not used: `sadgs {shlex.quote(str(source.parent))}` takes these cameras.")
 
 
-def _explain_few(found: str, summary: Summary, command: list[str]) -> str:
-    """Return the sentence on too few registered photos."""
-    remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
+def _explain_poor(found: str, summary: Summary, command: list[str]) -> str:
+    """Return the sentence on cameras that are wrong, or of too few photos."""
+    if summary.faults:
+        problem = f"{found}, but the cameras are wrong, because {'; and '.join(summary.faults)}; "
+        remedies = "begin another --output with such photos; "
+    else:
+        problem = f"only {found}, so the splat would show only what these saw: "
+        remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
     if summary.matching != "exhaustive":
         exhaustive = shlex.join([*command, "--matching", "exhaustive"])
         remedies += f"or compare more pairs of them with `{exhaustive}`, and run this command again; "
-    remedies += "or go on with these with --anyway."
-    return f"only {found}, so the splat would show only what these saw: {remedies}"
+    return f"{problem}{remedies}or go on with these with --anyway."
 
 
 class _CameraProgress:
@@ -85,7 +92,7 @@ class _CameraProgress:
         if event == "added":
             self.added = f"{fields['photos']}: "
         elif event in ("panoramas", "aside"):
-            self._line.print(fields["told"])
+            self._line.print(fields["sentence"])
         elif event == "unchanged":
             self.done_before = "; done before"
         elif event == "progress":
@@ -102,6 +109,7 @@ def train(work: PhotosToSplat, line: StatusLine) -> str:
         return f"{trained}; done before"
     is_resumed = results.checkpoint() is not None
     results.settings.trained = None  # The folder of an earlier run may have been deleted.
+    results.settings.measured = None
     if is_resumed:
         line.update("going on")
     else:
@@ -147,7 +155,7 @@ class _TrainingProgress:
         if event == "training begins":
             self.iterations = f"{fields['iterations']:,}"
         elif event == "warning":
-            self._line.print(adapt_remedy(fields["told"], self._work.train_options))
+            self._line.print(adapt_remedy(fields["sentence"], self._work.train_options))
         elif event == "iteration":
             self._work.exporter()  # Meanwhile it imports what export needs.
             status = f"iteration {fields['step']:,} of {self.iterations}"
@@ -209,3 +217,23 @@ class _ExportProgress:
         elif event == "export ends":
             megabytes = Path(output).stat().st_size / 1e6
             self.finished.append(f"{output}, {megabytes:,.1f} MB")
+
+
+def measure(work: PhotosToSplat, line: StatusLine) -> str:
+    """Measure how well run and file show the photos that were held out, unless that was done before."""
+    settings = work.results.settings
+    if settings.measured:
+        return f"{settings.measured}; done before"
+    line.update("starting")
+    worker = work.worker("measures", _MEASURING)
+
+    def on_event(event: str, **fields: Any) -> None:
+        if event == "progress":
+            line.update(f"{fields['stage']} {fields['done']} of {fields['total']}")
+        elif event == "warning":
+            line.print(fields["sentence"])
+
+    settings.measured = work.call(worker, line, on_event, [], work.results.run, work.data)
+    work.results.write_settings()
+    assert settings.measured is not None
+    return settings.measured

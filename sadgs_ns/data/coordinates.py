@@ -109,16 +109,31 @@ def spherical_harmonics(directions: Array, degree: int) -> Array:
     def root(numerator: float, denominator: float) -> float:
         return math.sqrt(numerator / (denominator * math.pi))
 
-    basis = [
-        np.full_like(x, root(1, 4)),
-        -root(3, 4) * y, root(3, 4) * z, -root(3, 4) * x,
-        root(15, 4) * x * y, -root(15, 4) * y * z, root(5, 16) * (3 * z * z - 1),
-        -root(15, 4) * x * z, root(15, 16) * (x * x - y * y),
-        -root(35, 32) * y * (3 * x * x - y * y), root(105, 4) * x * y * z, -root(21, 32) * y * (5 * z * z - 1),
-        root(7, 16) * z * (5 * z * z - 3), -root(21, 32) * x * (5 * z * z - 1),
-        root(105, 16) * z * (x * x - y * y), -root(35, 32) * x * (x * x - 3 * y * y),
-    ]  # fmt: skip
-    return np.stack(basis[: (degree + 1) ** 2], -1)
+    degree_0 = [np.full_like(x, root(1, 4))]
+    degree_1 = [
+        -root(3, 4) * y,
+        root(3, 4) * z,
+        -root(3, 4) * x,
+    ]
+    degree_2 = [
+        root(15, 4) * x * y,
+        -root(15, 4) * y * z,
+        root(5, 16) * (3 * z * z - 1),
+        -root(15, 4) * x * z,
+        root(15, 16) * (x * x - y * y),
+    ]
+    degree_3 = [
+        -root(35, 32) * y * (3 * x * x - y * y),
+        root(105, 4) * x * y * z,
+        -root(21, 32) * y * (5 * z * z - 1),
+        root(7, 16) * z * (5 * z * z - 3),
+        -root(21, 32) * x * (5 * z * z - 1),
+        root(105, 16) * z * (x * x - y * y),
+        -root(35, 32) * x * (x * x - 3 * y * y),
+    ]
+    basis = degree_0 + degree_1 + degree_2 + degree_3
+    number = (degree + 1) ** 2
+    return np.stack(basis[:number], axis=-1)
 
 
 def from_data(path: Path) -> Similarity:

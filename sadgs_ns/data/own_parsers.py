@@ -15,7 +15,6 @@ from nerfstudio.data.dataparsers.blender_dataparser import Blender
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParser
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNet
-from nerfstudio.data.scene_box import SceneBox
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.images import mask_name
 from sadgs_ns.data.run_frame import centre_poses, points_in_the_run, undo_centring
 from sadgs_ns.data.transforms import blender_images, read_blender
-from sadgs_ns.data.transforms_parser import TransformsParser
+from sadgs_ns.data.transforms_parser import TransformsParser, scene_box
 
 _BLENDER_SIDE = 1.5  # Half the side of the box around a Blender scene, which nerfstudio gives it
 
@@ -58,12 +57,11 @@ class BlenderParser(Blender):
         if ply_path is not None:
             identity = torch.eye(4)[:3]
             points = _read_ply(self.config.data / ply_path, identity, self.config.scale_factor)
-        side = _BLENDER_SIDE
         return DataparserOutputs(
             image_filenames=images,
             cameras=cameras,
             alpha_color=self.alpha_color_tensor,
-            scene_box=SceneBox(torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
+            scene_box=scene_box(_BLENDER_SIDE),
             dataparser_scale=self.scale_factor,
             metadata=points,
         )

@@ -75,20 +75,20 @@ class TransformsParser(Nerfstudio):
         points = {}
         if config.load_3D_points:
             points = _read_points(meta, folder, centring, transform, from_data, scale)
-        side = config.scene_scale
+        metadata = {
+            "depth_filenames": _select(depths, indices) or None,
+            "depth_unit_scale_factor": config.depth_unit_scale_factor,
+            "mask_color": config.mask_color,
+            **points,
+        }
         outputs = DataparserOutputs(
             image_filenames=_select(images, indices),
             cameras=cameras,
-            scene_box=SceneBox(torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
+            scene_box=scene_box(config.scene_scale),
             mask_filenames=_select(masks, indices) or None,
             dataparser_scale=scale,
             dataparser_transform=from_data,
-            metadata={
-                "depth_filenames": _select(depths, indices) or None,
-                "depth_unit_scale_factor": config.depth_unit_scale_factor,
-                "mask_color": config.mask_color,
-                **points,
-            },
+            metadata=metadata,
         )
         undo_centring(outputs, centring.of_data)
         move_to_fixed_frame(outputs, meta, path)
@@ -166,6 +166,12 @@ class TransformsParser(Nerfstudio):
         scale *= config.scale_factor
         poses[:, :3, 3] *= scale
         return poses[:, :3, :4], transform, scale
+
+
+def scene_box(half_side: float) -> SceneBox:
+    """Return a cube around the origin, given half the length of its edges."""
+    corners = [[-half_side] * 3, [half_side] * 3]
+    return SceneBox(torch.tensor(corners, dtype=torch.float32))
 
 
 def _select(files: Sequence[Path], indices: NDArray[np.integer]) -> list[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from functools import lru_cache
 from typing import NamedTuple
@@ -29,20 +30,25 @@ def share_rows(num_views: int, height: int, num_ranks: int) -> list[Band]:
     """
     # The last unit of a view also has the rows that ROWS leaves over, so that SSIM's window fits each band.
     units = max(height // ROWS, 1)
+    all_units = num_views * units
     bands = []
     for rank in range(num_ranks):
-        start, end = (r * num_views * units // num_ranks for r in (rank, rank + 1))
-        for view in range(start // units, -(-end // units)):
+        start = rank * all_units // num_ranks
+        end = (rank + 1) * all_units // num_ranks
+        first_view = start // units
+        end_view = math.ceil(end / units)
+        for view in range(first_view, end_view):
             begin = max(start - view * units, 0)
             stop = min(end - view * units, units)
+            if begin >= stop:
+                continue
             first = begin * ROWS
             last = stop * ROWS
             if stop == units:
                 last = height
-            if begin < stop:
-                top = max(first - MARGIN, 0)
-                bottom = min(last + MARGIN, height)
-                bands.append(Band(view, rank, first, last, top, bottom))
+            top = max(first - MARGIN, 0)
+            bottom = min(last + MARGIN, height)
+            bands.append(Band(view, rank, first, last, top, bottom))
     return bands
 
 
@@ -56,5 +62,9 @@ def views_of_rank(sizes: tuple[tuple[int, int], ...], num_ranks: int, rank: int)
     groups: dict[tuple[int, int], list[int]] = defaultdict(list)
     for view, size in enumerate(sizes):
         groups[size].append(view)
-    bands = ((share_rows(len(views), height, num_ranks), views) for (height, _), views in groups.items())
-    return tuple(views[band.view] for shared, views in bands for band in shared if band.rank == rank)
+    composited = []
+    for (height, _), views in groups.items():
+        for band in share_rows(len(views), height, num_ranks):
+            if band.rank == rank:
+                composited.append(views[band.view])
+    return tuple(composited)

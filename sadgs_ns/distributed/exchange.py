@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -38,19 +39,23 @@ class Exchange:
         self.fused = world.uses_kernels
         self.whole_views = len(bands) == len(projected.opacities)
         reached = _reached(projected, bands)  # [B, N]
-        counted = torch.cat([reached.sum(1), torch.tensor([world.flags_out], device=world.device)])
+        flags = torch.tensor([world.flags_out], device=world.device)
+        counted = torch.cat([reached.sum(1), flags])  # [B + 1]
         gathered = world.gather(counted)  # [R, B + 1]
         n = reached.shape[1]
         self.places = reached.flatten().nonzero()[:, 0]  # [M], in B · N
-        if any(band.view != index for index, band in enumerate(bands)):
-            views = torch.tensor([band.view for band in bands], device=world.device)
+        band_views = [band.view for band in bands]
+        if band_views != list(range(len(bands))):
+            views = torch.tensor(band_views, device=world.device)  # [B]
             self.places = views[self.places // n] * n + self.places % n
         table = gathered.tolist()
         for row in table:
             world.flags_in |= row.pop()
         mine = [index for index, band in enumerate(bands) if band.rank == world.rank]
         self.bands = [bands[index] for index in mine]
-        self.counts = [[row[index] for index in mine] for row in table]
+        self.counts: list[list[int]] = []
+        for row in table:
+            self.counts.append([row[index] for index in mine])
         self._received = [sum(row) for row in self.counts]
         self._sent = [0] * world.num_ranks
         for band, number in zip(bands, table[world.rank], strict=True):
@@ -67,10 +72,11 @@ class Exchange:
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
         anchor, *flat = _Exchanged.apply(self, absgrad, *projected[:6])  # type: ignore[misc]
-        received = [
-            Projected(*flat[6 * i : 6 * i + 6], width=projected.width, height=band.bottom - band.top)
-            for i, band in enumerate(self.bands)
-        ]
+        received = []
+        for index, band in enumerate(self.bands):
+            tensors = flat[6 * index : 6 * index + 6]
+            height = band.bottom - band.top
+            received.append(Projected(*tensors, width=projected.width, height=height))
         if absgrad and torch.is_grad_enabled():
             # These hold the graph, which holds this object, until `backward` releases them.
             self.absolute = [part.means2d for part in received]
@@ -91,7 +97,9 @@ class Exchange:
         if len(parts) == 1:
             rows = parts[0]  # They came in the order of the processes.
         elif parts:
-            rows = torch.cat(_transposed(torch.cat([*parts]), list(zip(*self.counts, strict=True))))
+            by_band = torch.cat([*parts])
+            counts_of_bands = list(zip(*self.counts, strict=True))
+            rows = torch.cat(_transposed(by_band, counts_of_bands))
         received = rows.new_empty((len(self.places), nothing.shape[1]))
         dist.all_to_all_single(received, rows.contiguous(), self._sent, self._received)
         return received
@@ -119,8 +127,12 @@ class _Exchanged(torch.autograd.Function):
         for band, received in zip(exchange.bands, exchange.forth(rows), strict=True):
             if not len(received):
                 received = received.new_zeros((1, received.shape[1]))  # A Gaussian whose radius is 0 is not drawn.
-            part = unpack(received, band.top) if kernel is None else kernel.unpack(received.contiguous(), band.top)
-            ctx.mark_non_differentiable(part[0])
+            if kernel is None:
+                part = unpack(received, band.top)
+            else:
+                part = kernel.unpack(received.contiguous(), band.top)
+            radii = part[0]
+            ctx.mark_non_differentiable(radii)
             outputs += part
         return means2d.new_zeros(()), *outputs
 
@@ -129,17 +141,27 @@ class _Exchanged(torch.autograd.Function):
     def backward(ctx: Any, _: Tensor | None, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         exchange: Exchange = ctx.exchange
         (means2d,) = ctx.saved_tensors
-        widths = list(_GRADIENTS) if exchange.fused else [2, 3, 1, 3, *[2] * ctx.absgrad]
+        if exchange.fused:
+            widths = list(_GRADIENTS)
+        elif ctx.absgrad:
+            widths = [2, 3, 1, 3, 2]
+        else:
+            widths = [2, 3, 1, 3]
         parts = []
-        for i in range(len(exchange.bands)):
-            number = sum(row[i] for row in exchange.counts)
-            _, v_means2d, _, v_conics, v_opacities, v_colors = gradients[6 * i : 6 * i + 6]  # Depths decide no colour.
-            v_absolute = getattr(exchange.absolute[i], "absgrad", None) if ctx.absgrad else None
+        for index in range(len(exchange.bands)):
+            number = sum(row[index] for row in exchange.counts)
+            of_band = gradients[6 * index : 6 * index + 6]
+            _, v_means2d, _, v_conics, v_opacities, v_colors = of_band  # Depths decide no colour.
+            v_absolute = None
+            if ctx.absgrad:
+                v_absolute = getattr(exchange.absolute[index], "absgrad", None)
             columns = [v_means2d, v_conics, v_opacities, v_colors, v_absolute, None][: len(widths)]
             parts.append(_gradient_rows(columns, widths, number, like=means2d))
         exchange.absolute = []
-        rows = exchange.back(parts, means2d.new_empty((0, sum(widths))))
-        dense = means2d.new_zeros((ctx.shape.numel(), sum(widths)))
+        width = sum(widths)
+        nothing = means2d.new_empty((0, width))
+        rows = exchange.back(parts, nothing)  # [M, width]
+        dense = means2d.new_zeros((ctx.shape.numel(), width))  # [V · N, width]
         if exchange.whole_views:
             dense.index_copy_(0, exchange.places, rows)
         else:
@@ -158,20 +180,21 @@ def pack(projected: Sequence[Tensor], places: Tensor) -> Tensor:
     """
     radii, means2d, depths, conics, opacities, colors = projected
     size = opacities.numel()
-    taken = [value.reshape(size, -1)[places] for value in (means2d, conics, opacities, colors, depths, radii)]
-    return _beside([*taken[:-1], taken[-1].to(means2d.dtype)])
+    columns = [value.reshape(size, -1)[places] for value in (means2d, conics, opacities, colors, depths)]
+    radii_column = radii.reshape(size, -1)[places].to(means2d.dtype)
+    return _beside([*columns, radii_column])
 
 
 def unpack(rows: Tensor, top: int) -> tuple[Tensor, ...]:
     """Return the six tensors of `Projected` of one view from rows of `pack`; centres are counted from row `top`."""
-    per_gaussian = rows.shape[1] - 10
-    means2d, conics, opacities, colors, depths, radii = (
-        column.clone(memory_format=torch.contiguous_format)
-        for column in rows[None].split([2, 3, 1, 3, 1, per_gaussian], dim=-1)
-    )
+    radii_of_one = rows.shape[1] - 10  # Number of radii of a Gaussian
+    parts = rows[None].split([2, 3, 1, 3, 1, radii_of_one], dim=-1)
+    contiguous = [part.clone(memory_format=torch.contiguous_format) for part in parts]
+    means2d, conics, opacities, colors, depths, radii = contiguous
     means2d[..., 1] -= top
-    radii = radii.int() if per_gaussian == 2 else radii[..., 0].int()
-    return radii, means2d, depths[..., 0], conics, opacities[..., 0], colors
+    if radii_of_one == 1:
+        radii = radii[..., 0]
+    return radii.int(), means2d, depths[..., 0], conics, opacities[..., 0], colors
 
 
 def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], number: int, like: Tensor) -> Tensor:
@@ -179,18 +202,32 @@ def _gradient_rows(columns: Sequence[Tensor | None], widths: Sequence[int], numb
 
     [1, at least M, width] each, or [1, at least M] → [M, sum of the widths]. Those of our compositing are such parts.
     """
-    width = sum(widths)
+    whole_width = sum(widths)
     first = columns[0]
-    whole = all(value is not None for value in columns[:4])
-    if whole and first is not None and first.dim() == 3 and first.stride()[1:] == (width, 1):
-        starts = [first.data_ptr() + first.element_size() * sum(widths[:i]) for i in range(len(widths))]
-        if all(value is None or value.data_ptr() == start for value, start in zip(columns, starts, strict=True)):
-            return first.as_strided((number, width), (width, 1))
-    filled = [
-        like.new_zeros((number, width)) if value is None else value.reshape(-1, width)[:number]
-        for value, width in zip(columns, widths, strict=True)
-    ]
+    if first is not None and _are_parts_of_rows(columns, widths):
+        return first.as_strided((number, whole_width), (whole_width, 1))
+    filled = []
+    for value, width in zip(columns, widths, strict=True):
+        if value is None:
+            filled.append(like.new_zeros((number, width)))
+        else:
+            filled.append(value.reshape(-1, width)[:number])
     return _beside(filled)
+
+
+def _are_parts_of_rows(columns: Sequence[Tensor | None], widths: Sequence[int]) -> bool:
+    """Return whether gradients, as `_gradient_rows` takes them, lie side by side in rows; the last two may be None."""
+    first = columns[0]
+    if first is None or any(value is None for value in columns[1:4]):
+        return False
+    if first.dim() != 3 or first.stride()[1:] != (sum(widths), 1):
+        return False
+    starts = accumulate(widths, initial=0)  # In columns
+    for value, start in zip(columns, starts, strict=False):
+        address = first.data_ptr() + first.element_size() * start
+        if value is not None and value.data_ptr() != address:
+            return False
+    return True
 
 
 @torch.no_grad()
@@ -199,18 +236,20 @@ def _reached(projected: Projected, bands: Sequence[Band]) -> Tensor:
     radii = projected.radii
     means2d = projected.means2d
     visible = drawn(radii, means2d)  # [V, N]
-    if all(band.view == index for index, band in enumerate(bands)) and len(bands) == len(visible):
+    if [band.view for band in bands] == list(range(len(visible))):
         return visible
     y = means2d[..., 1]  # [V, N]
     if radii.dim() == 3:
         reach = radii[..., 1]  # [V, N]
     else:
         reach = radii
-    below = y + reach
-    above = y - reach
-    return torch.stack(
-        [visible[band.view] & (below[band.view] > band.top) & (above[band.view] < band.bottom) for band in bands]
-    )
+    lowest = y + reach
+    highest = y - reach
+    of_bands = []
+    for band in bands:
+        in_rows = (lowest[band.view] > band.top) & (highest[band.view] < band.bottom)
+        of_bands.append(visible[band.view] & in_rows)
+    return torch.stack(of_bands)
 
 
 def _beside(values: Sequence[Tensor]) -> Tensor:

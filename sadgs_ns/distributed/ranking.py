@@ -17,7 +17,7 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
     Each one is taken if it fits into the budget that those before it left; of equal priorities the first come first, in
     the order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block
     all others near the cap. Instead of a sort, histograms of the priorities, summed over the processes, find the first
-    Gaussian that does not fit, and then the first of smaller ones; that takes less time, alone, too.
+    Gaussian that does not fit, and then the first of smaller ones; that takes less time, in one process, too.
 
     `growth` is the number of Gaussians that each one of this process would add, ≥ 0, int64 [N], and its `priority` is
     ≥ 0 [N]. `budget` is the number that may be added in all, the same in all processes; ≤ 0 allows none. Gaussians that
@@ -28,11 +28,14 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
     allowed = torch.zeros_like(growth, dtype=torch.bool)
     while True:
         fits = (growth > 0) & (growth <= budget) & ~allowed
-        if int(world.sum(torch.where(fits, growth, 0).sum())) <= max(budget, 0):
+        wanted = torch.where(fits, growth, 0)
+        total = world.sum(wanted.sum())
+        if int(total) <= max(budget, 0):
             return allowed | fits
-        taken = _up_to_first_that_does_not_fit(world, torch.where(fits, growth, 0), bits, budget)
+        taken = _up_to_first_that_does_not_fit(world, wanted, bits, budget)
         allowed |= taken
-        budget -= int(world.sum(growth[taken].sum()))
+        spent = world.sum(growth[taken].sum())
+        budget -= int(spent)
 
 
 def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
@@ -41,15 +44,20 @@ def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, b
     before = 0
     threshold = 0
     for shift, width in _DIGITS:
-        digits = ((bits >> shift) & ((1 << width) - 1)).long()
-        histogram = growth.new_zeros(1 << width).scatter_add_(0, digits, torch.where(equal, growth, 0))
+        largest = (1 << width) - 1
+        digits = ((bits >> shift) & largest).long()
+        growth_of_equal = torch.where(equal, growth, 0)
+        histogram = growth.new_zeros(1 << width)
+        histogram.scatter_add_(0, digits, growth_of_equal)
         from_top = world.sum(histogram).flip(0).cumsum(0)  # It grows as the digit falls.
         index = int((before + from_top <= budget).sum())
-        before += int(from_top[index - 1]) if index > 0 else 0
-        digit = (1 << width) - 1 - index
+        if index > 0:
+            before += int(from_top[index - 1])
+        digit = largest - index
         equal &= digits == digit
         threshold |= digit << shift
     ties = torch.where(equal, growth, 0)
-    totals = world.gather(ties.sum()[None])[:, 0]
+    totals = world.gather(ties.sum()[None])[:, 0]  # [R]
     before += int(totals[: world.rank].sum())
-    return (growth > 0) & ((bits > threshold) | equal & (before + ties.cumsum(0) <= budget))
+    ties_that_fit = equal & (before + ties.cumsum(0) <= budget)
+    return (growth > 0) & ((bits > threshold) | ties_that_fit)

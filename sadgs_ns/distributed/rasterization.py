@@ -31,16 +31,17 @@ def rasterize(
     are those of this process, and `world.sizes` must be right. Several processes wait for the exact lengths of tile
     lists, and give `viewmats` no gradient. Raises InputError as `render.rasterization.rasterize`.
 
-    Returns the pictures that this process composited, a single one of everything where it is alone, and the `info` of
-    its Gaussians in all views. With several processes, `info` has `anchor`, which `Exchange.send` returns, and
-    `num_pairs` and `num_pixels` that this process composited.
+    Returns the pictures that this process composited, and the `info` of its Gaussians in all views. A single process
+    composites one picture of everything. With several processes, `info` has `anchor`, which `Exchange.send` returns,
+    and `num_pairs` and `num_pixels` that this process composited.
     """
-    if world.alone:
+    if world.is_single:
         colors, alphas, info = render.rasterize(gaussians, cameras, options)
         return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)
     projected = render.project(gaussians, cameras, options, begin_tiles=False)
-    exchange = Exchange(world, projected, share_rows(len(cameras.viewmats), cameras.height, world.num_ranks))
+    bands = share_rows(len(cameras.viewmats), cameras.height, world.num_ranks)
+    exchange = Exchange(world, projected, bands)
     anchor, received = exchange.send(projected, options.absgrad)
     pictures = []
     num_pairs = 0
@@ -48,6 +49,7 @@ def rasterize(
     for band, splats in zip(exchange.bands, received, strict=True):
         colors, alphas, info = render.composite(splats, options)
         pictures.append(Picture(band, colors, alphas))
-        num_pairs = num_pairs + len(info["flatten_ids"])
-        num_pixels = num_pixels + splats.height * splats.width
-    return pictures, projected.info() | {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}
+        num_pairs += len(info["flatten_ids"])
+        num_pixels += splats.height * splats.width
+    of_exchange = {"anchor": anchor, "num_pairs": num_pairs, "num_pixels": num_pixels}
+    return pictures, projected.info() | of_exchange

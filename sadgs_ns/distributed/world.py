@@ -34,10 +34,16 @@ class World:
     """
 
     def __init__(self, device: torch.device | None = None) -> None:
-        self.rank, self.num_ranks = (0, 1) if device is None else (dist.get_rank(), dist.get_world_size())
-        self.device = torch.device("cpu") if device is None else device
+        self.rank = 0
+        self.num_ranks = 1
+        self.device = torch.device("cpu")
+        if device is not None:
+            self.rank = dist.get_rank()
+            self.num_ranks = dist.get_world_size()
+            self.device = device
         self.sizes: list[int] = [0] * self.num_ranks
-        self.flags_out = self.flags_in = 0
+        self.flags_out = 0
+        self.flags_in = 0
 
     @cached_property
     def uses_kernels(self) -> bool:
@@ -45,8 +51,8 @@ class World:
         return self.all(use_triton(self.device))
 
     @property
-    def alone(self) -> bool:
-        """Whether this process holds all Gaussians."""
+    def is_single(self) -> bool:
+        """Whether this is the only process, which holds all Gaussians."""
         return self.num_ranks == 1
 
     @property
@@ -56,7 +62,8 @@ class World:
 
     def even_sizes(self, total: int) -> list[int]:
         """Return the sizes of equal shards, which differ by one at most."""
-        return [(r + 1) * total // self.num_ranks - r * total // self.num_ranks for r in range(self.num_ranks)]
+        ends = [rank * total // self.num_ranks for rank in range(self.num_ranks + 1)]
+        return [end - start for start, end in pairwise(ends)]
 
     def take_even_part(self, total: int) -> slice:
         """Share Gaussians out that all processes have, and return this one's; raise InputError if they are too few."""
@@ -68,11 +75,12 @@ class World:
 
     def count(self, number: int) -> None:
         """Update `sizes`, given the number of Gaussians of this process."""
-        self.sizes = self.gather(torch.tensor([number], device=self.device))[:, 0].tolist()
+        own = torch.tensor([number], device=self.device)
+        self.sizes = self.gather(own)[:, 0].tolist()
 
     def gather(self, values: Tensor) -> Tensor:
         """Return the values of all processes, of one length, in the order of their ranks. [n] → [R, n]"""
-        if self.alone:
+        if self.is_single:
             return values[None]
         gathered = values.new_empty(self.num_ranks * len(values))
         dist.all_gather_into_tensor(gathered, values)
@@ -80,24 +88,28 @@ class World:
 
     def sum(self, values: Tensor) -> Tensor:
         """Add up the values of all processes, of one shape, in place, and return them."""
-        if not self.alone:
+        if not self.is_single:
             dist.all_reduce(values)
         return values
 
     def sums(self, *numbers: int) -> list[int]:
         """Return the sums of whole numbers over the processes; one process needs no tensor for them."""
-        return list(numbers) if self.alone else self.sum(torch.tensor(numbers, device=self.device)).tolist()
+        if self.is_single:
+            return list(numbers)
+        own = torch.tensor(numbers, device=self.device)
+        return self.sum(own).tolist()
 
     def broadcast(self, values: Tensor, rank: int) -> None:
         """Overwrite a contiguous tensor, of one shape everywhere, with that of one process."""
-        if not self.alone:
+        if not self.is_single:
             dist.broadcast(values, rank)
 
     def least(self, number: float) -> float:
         """Return the least of the numbers of all processes, which may be infinite."""
-        if self.alone:
+        if self.is_single:
             return number
-        return float(self.gather(torch.tensor([number], dtype=torch.float64, device=self.device)).min())
+        own = torch.tensor([number], dtype=torch.float64, device=self.device)
+        return float(self.gather(own).min())
 
     def all(self, condition: bool) -> bool:
         """Return whether a condition holds in all processes."""
@@ -108,12 +120,14 @@ class World:
 
         All processes draw all numbers, so that their generators stay alike; on the CPU as `torch.rand((V, total, 2))`.
         """
-        if self.alone:
+        if self.is_single:
             return torch.rand(like.shape, device=like.device)
         kept = []
         for _ in range(len(like)):
-            drawn = (torch.rand((n, 2), device=like.device) for n in self.sizes)
-            kept += [numbers for rank, numbers in enumerate(drawn) if rank == self.rank]
+            for rank, size in enumerate(self.sizes):
+                drawn = torch.rand((size, 2), device=like.device)
+                if rank == self.rank:
+                    kept.append(drawn)
         return torch.stack(kept)
 
     def is_uneven(self) -> bool:
@@ -133,19 +147,25 @@ class World:
     def gather_rows(self, rows: Tensor) -> Tensor:
         """Gather the rows of all Gaussians on the host of rank 0 [N, …] → [total, …]; others get their own back."""
         rows = rows.detach()
-        starts = [range(0, size if math.prod(rows.shape[1:]) else 0, _ROWS_AT_ONCE) for size in self.sizes]
+        width = rows.shape[1:]
+        is_empty = math.prod(width) == 0  # Then there is nothing to send.
         if self.rank > 0:
-            for start in starts[self.rank]:
-                dist.send(rows[start : start + _ROWS_AT_ONCE].contiguous(), 0)
+            if not is_empty:
+                for start in range(0, self.sizes[self.rank], _ROWS_AT_ONCE):
+                    dist.send(rows[start : start + _ROWS_AT_ONCE].contiguous(), 0)
             return rows
-        gathered = torch.empty((self.total, *rows.shape[1:]), dtype=rows.dtype)
+        gathered = torch.empty((self.total, *width), dtype=rows.dtype)
+        if is_empty:
+            return gathered
         gathered[: len(rows)] = rows.cpu()
         end = len(rows)
         for rank, size in enumerate(self.sizes[1:], start=1):
-            for start in starts[rank]:
-                part = rows.new_empty((min(size - start, _ROWS_AT_ONCE), *rows.shape[1:]))
+            for start in range(0, size, _ROWS_AT_ONCE):
+                number = min(size - start, _ROWS_AT_ONCE)
+                part = rows.new_empty((number, *width))
                 dist.recv(part, rank)
-                gathered[end + start : end + start + len(part)] = part.cpu()
+                first = end + start
+                gathered[first : first + number] = part.cpu()
             end += size
         return gathered
 
@@ -154,5 +174,8 @@ def _overlaps(ours: Sequence[int], theirs: Sequence[int], rank: int) -> list[int
     """Return how many of the rows that `rank` has by `ours` each rank has by `theirs`."""
     start = sum(ours[:rank])
     end = sum(ours[: rank + 1])
-    ranges = pairwise(accumulate(theirs, initial=0))
-    return [max(min(end, last) - max(start, first), 0) for first, last in ranges]
+    overlaps = []
+    for their_start, their_end in pairwise(accumulate(theirs, initial=0)):
+        overlap = min(end, their_end) - max(start, their_start)
+        overlaps.append(max(overlap, 0))
+    return overlaps

@@ -25,12 +25,13 @@ MESH = ".mesh.ply"  # End of the name of a triangle mesh
 
 def format_of(path: Path) -> str:
     """Return the key of `FORMATS`, or `MESH`, in which a file's name ends; raise InputError for others and folders."""
-    found = [suffix for suffix in (*FORMATS, MESH) if path.name.lower().endswith(suffix)]
-    if not found:
+    name = path.name.lower()
+    suffixes = [suffix for suffix in (*FORMATS, MESH) if name.endswith(suffix)]
+    if not suffixes:
         raise InputError(f"--output {path} must end in {', '.join(FORMATS)} or {MESH}.")
     if path.is_dir():
         raise InputError(f"--output {path} is a folder: name a file in it.")
-    return max(found, key=len)
+    return max(suffixes, key=len)
 
 
 def write(path: Path, gaussians: Gaussians, context: Context = DEFAULTS) -> None:

@@ -57,27 +57,33 @@ class Gaussians:
     @property
     def degree(self) -> int:
         """Highest degree of the harmonics, 0 … 3."""
-        return round((1 + self.features_rest.shape[1]) ** 0.5) - 1
+        num_harmonics = 1 + self.features_rest.shape[1]
+        return round(num_harmonics**0.5) - 1
 
     def finite(self) -> Gaussians:
         """Return those whose numbers all are finite."""
         sound = np.ones(len(self), bool)
         for value in vars(self).values():
             sound &= np.isfinite(value).reshape(len(self), -1).all(axis=1)
-        return self if sound.all() else self[sound]
+        if sound.all():
+            return self
+        return self[sound]
 
     def moved(self, similarity: Similarity) -> Gaussians:
         """Return the Gaussians in another frame, with their harmonics turned; some may become infinite there."""
-        parts = {name: np.empty_like(getattr(self, name)) for name in ("means", "scales", "quats", "features_rest")}
+        means = np.empty_like(self.means)
+        scales = np.empty_like(self.scales)
+        quats = np.empty_like(self.quats)
+        features_rest = np.empty_like(self.features_rest)
         turn = similarity.harmonics(self.degree)[1:, 1:]
         with np.errstate(all="ignore"):
             for start in range(0, len(self), ROWS):
                 rows = slice(start, start + ROWS)
-                parts["means"][rows] = similarity.positions(self.means[rows].astype(np.float64))
-                parts["scales"][rows] = similarity.log_scales(self.scales[rows].astype(np.float64))
-                parts["quats"][rows] = similarity.rotations(self.quats[rows].astype(np.float64))
-                parts["features_rest"][rows] = turn @ self.features_rest[rows].astype(np.float64)
-        return replace(self, **parts)
+                means[rows] = similarity.positions(self.means[rows].astype(np.float64))
+                scales[rows] = similarity.log_scales(self.scales[rows].astype(np.float64))
+                quats[rows] = similarity.rotations(self.quats[rows].astype(np.float64))
+                features_rest[rows] = turn @ self.features_rest[rows].astype(np.float64)
+        return replace(self, means=means, scales=scales, quats=quats, features_rest=features_rest)
 
 
 def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
@@ -88,16 +94,27 @@ def of_parameters(params: Mapping[str, NDArray[np.floating]]) -> Gaussians:
     """
     count = len(params["means"])
     rest = params["features_rest"]
-    bands = rest.shape[1] if rest.ndim == 3 else 0
+    bands = 0
+    if rest.ndim == 3:
+        bands = rest.shape[1]
     if bands not in (0, 3, 8, 15):
         raise ValueError(f"features_rest must hold the 0, 3, 8 or 15 harmonics of degree 1 to 3, got {bands}")
-    opacities = params["opacities"]
-    arrays = {**params, "opacities": opacities[:, 0] if opacities.shape[1:] == (1,) else opacities}
-    shapes = {name: (3,) for name in ("means", "features_dc", "scales")}
-    shapes |= {"features_rest": (bands, 3), "opacities": (), "quats": (4,)}
+    arrays = dict(params)
+    if arrays["opacities"].shape[1:] == (1,):
+        arrays["opacities"] = arrays["opacities"][:, 0]
+    shapes = {
+        "means": (count, 3),
+        "features_dc": (count, 3),
+        "scales": (count, 3),
+        "features_rest": (count, bands, 3),
+        "opacities": (count,),
+        "quats": (count, 4),
+    }
     for name, shape in shapes.items():
-        if arrays[name].shape != (count, *shape):
-            raise ValueError(f"{name} must have the shape {[count, *shape]}, got {list(arrays[name].shape)}")
+        if arrays[name].shape != shape:
+            raise ValueError(f"{name} must have the shape {list(shape)}, got {list(arrays[name].shape)}")
+    quats = arrays["quats"]
     with np.errstate(all="ignore"):  # Infinities and NaN are dropped later.
-        arrays["quats"] = arrays["quats"] / np.maximum(np.linalg.norm(arrays["quats"], axis=1, keepdims=True), 1e-12)
+        lengths = np.linalg.norm(quats, axis=1, keepdims=True)  # [N, 1]
+        arrays["quats"] = quats / np.maximum(lengths, 1e-12)
     return Gaussians(**{name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in shapes})

@@ -19,6 +19,8 @@ _FLOAT = 5126
 _BYTE = 5121
 _ARRAY_BUFFER = 34962
 _POINTS = 0
+_JSON_CHUNK = 0x4E4F534A  # The letters "JSON", by which a file marks its description
+_BINARY_CHUNK = 0x004E4942  # The letters "BIN"
 _MOST_BYTES = (1 << 32) - 1
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
@@ -28,63 +30,92 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
 
     Viewers that do not know the extension show coloured points. The node turns y up, as in glTF.
     """
-    x, y, z = context.up
-    turn = np.array([-z, 0.0, x, 1 + y] if y > -1 else [1.0, 0.0, 0.0, 0.0])  # This quaternion, xyzw, turns up to y.
     attributes = _attributes(gaussians)
-    arrays = list(attributes.values())
-    sizes = [array.nbytes for array in arrays]
+    document = _document(attributes, _turn_to_y(context.up))
+    head = json.dumps(document).encode()
+    padding = -len(head) % 4
+    head += b" " * padding
+    content = sum(array.nbytes for array in attributes.values())  # In bytes
+    total = 12 + 8 + len(head) + 8 + content
+    if total > _MOST_BYTES:
+        problem = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
+        raise InputError(f"{problem}: choose another format.")
+    file.write(struct.pack("<4sII", b"glTF", 2, total))
+    file.write(struct.pack("<II", len(head), _JSON_CHUNK))
+    file.write(head)
+    file.write(struct.pack("<II", content, _BINARY_CHUNK))
+    for array in attributes.values():
+        file.write(array.tobytes())
+
+
+def _turn_to_y(up: tuple[float, float, float]) -> list[float]:
+    """Return the quaternion, xyzw, that turns an axis of the Gaussians' frame to y."""
+    x, y, z = up
+    if y > -1:
+        turn = np.array([-z, 0.0, x, 1 + y])
+    else:
+        turn = np.array([1.0, 0.0, 0.0, 0.0])
+    return (turn / np.linalg.norm(turn)).tolist()
+
+
+def _document(attributes: dict[str, NDArray[Any]], rotation: list[float]) -> dict[str, Any]:
+    """Return glTF's description of a mesh of points with these attributes, in a node with a rotation."""
     accessors: list[dict[str, Any]] = []
-    for index, array in enumerate(arrays):
-        kind = {"componentType": _BYTE if array.dtype == np.uint8 else _FLOAT, "type": _TYPES[array.shape[1]]}
-        accessors.append({"bufferView": index, "count": len(gaussians), **kind})
-    accessors[0] |= {"min": gaussians.means.min(axis=0).tolist(), "max": gaussians.means.max(axis=0).tolist()}
-    accessors[list(attributes).index("COLOR_0")]["normalized"] = True
-    properties = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "sortingMethod": "cameraDistance"}
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(attributes)},
-        "mode": _POINTS,
-        "extensions": {_EXTENSION: properties | {"projection": "perspective"}},
+    views: list[dict[str, int]] = []
+    offset = 0
+    for index, array in enumerate(attributes.values()):
+        component = _FLOAT
+        if array.dtype == np.uint8:
+            component = _BYTE
+        count, width = array.shape
+        size = array.nbytes
+        accessor = {"bufferView": index, "count": count, "componentType": component, "type": _TYPES[width]}
+        accessors.append(accessor)
+        view = {"buffer": 0, "byteOffset": offset, "byteLength": size, "target": _ARRAY_BUFFER}
+        views.append(view)
+        offset += size
+    numbers = {name: index for index, name in enumerate(attributes)}
+    positions = attributes["POSITION"]
+    of_positions = accessors[numbers["POSITION"]]
+    of_positions["min"] = positions.min(axis=0).tolist()
+    of_positions["max"] = positions.max(axis=0).tolist()
+    accessors[numbers["COLOR_0"]]["normalized"] = True
+    splats = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "sortingMethod": "cameraDistance",
+        "projection": "perspective",
     }
-    document = {
+    primitive = {"attributes": numbers, "mode": _POINTS, "extensions": {_EXTENSION: splats}}
+    return {
         "asset": {"version": "2.0", "generator": "sadgs_ns"},
         "extensionsUsed": [_EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": (turn / np.linalg.norm(turn)).tolist()}],
+        "nodes": [{"mesh": 0, "rotation": rotation}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": sum(sizes[:index]), "byteLength": size, "target": _ARRAY_BUFFER}
-            for index, size in enumerate(sizes)
-        ],
-        "buffers": [{"byteLength": sum(sizes)}],
+        "bufferViews": views,
+        "buffers": [{"byteLength": offset}],
     }
-    head = json.dumps(document).encode()
-    head += b" " * (-len(head) % 4)
-    total = 12 + 8 + len(head) + 8 + sum(sizes)
-    if total > _MOST_BYTES:
-        problem = f"{len(gaussians):,} Gaussians take more than the 4 GB that glTF can hold"
-        raise InputError(f"{problem}: choose another format.")
-    file.write(struct.pack("<4sIIII", b"glTF", 2, total, len(head), 0x4E4F534A) + head)
-    file.write(struct.pack("<II", sum(sizes), 0x004E4942))
-    for array in arrays:
-        file.write(array.tobytes())
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, NDArray[Any]]:
     """Return the arrays of a value for each Gaussian, whose sizes are multiples of 4 bytes, by glTF's names."""
-    alphas = sigmoid(gaussians.opacities)[:, None]
-    colors = np.c_[gaussians.features_dc * np.float32(DEGREE_0) + np.float32(0.5), alphas]
+    alphas = sigmoid(gaussians.opacities)[:, None]  # [N, 1]
+    rgb = gaussians.features_dc * np.float32(DEGREE_0) + np.float32(0.5)
+    rgba = np.c_[rgb, alphas]
     attributes: dict[str, NDArray[Any]] = {
         "POSITION": gaussians.means,
-        "COLOR_0": to_bytes(255 * colors),
+        "COLOR_0": to_bytes(255 * rgba),
         f"{_EXTENSION}:ROTATION": gaussians.quats[:, [1, 2, 3, 0]],
         f"{_EXTENSION}:SCALE": np.exp(gaussians.scales),
         f"{_EXTENSION}:OPACITY": alphas,
         f"{_EXTENSION}:SH_DEGREE_0_COEF_0": gaussians.features_dc,
     }
     for degree in range(1, gaussians.degree + 1):
+        first_of_degree = degree**2 - 1
         for index in range(2 * degree + 1):
             name = f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{index}"
-            attributes[name] = gaussians.features_rest[:, degree**2 - 1 + index]
+            attributes[name] = gaussians.features_rest[:, first_of_degree + index]
     return attributes

@@ -40,9 +40,10 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     """
     assert context.start is not None
     page = _page()
-    content = io.BytesIO()
     settings = _settings(context.start)
-    sog.write(content, gaussians.moved(Similarity(1.0, _TO_CONTENT, np.zeros(3))), context)
+    to_content = Similarity(1.0, _TO_CONTENT, np.zeros(3))
+    content = io.BytesIO()
+    sog.write(content, gaussians.moved(to_content), context)
     encoded = base64.b64encode(content.getvalue()).decode()
 
     def fill(found: re.Match[bytes]) -> bytes:
@@ -59,13 +60,23 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
 
 def _settings(start: Start) -> dict[str, Any]:
     """Return the viewer's settings for a start, and for colours as they were trained."""
-    pose: dict[str, Any] = {name: (_TO_VIEWER @ getattr(start, name)).tolist() for name in ("position", "target")}
-    values = pose | {"fov": [start.degrees]}
-    track = {"name": "start", "duration": 1, "frameRate": 1, "loopMode": "none", "interpolation": "step"}
+    position = (_TO_VIEWER @ start.position).tolist()
+    target = (_TO_VIEWER @ start.target).tolist()
+    camera = {"position": position, "target": target, "fov": start.degrees}
+    values = {"position": position, "target": target, "fov": [start.degrees]}
+    # Without a track, here of one position, the viewer begins with a flight of its own.
+    track = {
+        "name": "start",
+        "duration": 1,
+        "frameRate": 1,
+        "loopMode": "none",
+        "interpolation": "step",
+        "smoothness": 0,
+        "keyframes": {"times": [0], "values": values},
+    }
     return {
-        "cameras": [{"initial": pose | {"fov": start.degrees}}],
-        # Without a track, here of one position, the viewer begins with a flight of its own.
-        "animTracks": [{**track, "smoothness": 0, "keyframes": {"times": [0], "values": values}}],
+        "cameras": [{"initial": camera}],
+        "animTracks": [track],
         "startMode": "animTrack",
         "tonemapping": "none",
     }
@@ -77,22 +88,40 @@ def _page() -> bytes:
     npx = shutil.which("npx")
     if npx is None:
         raise InputError(f"HTML is written with the help of Node.js, whose npx is not there: {remedy}.")
-    one = np.zeros((1, 3), np.float32)
-    point = Gaussians(one, one - 5, np.eye(1, 4, dtype=np.float32), one[:, 0], one, np.zeros((1, 0, 3), np.float32))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "point.ply"
+        page = path.with_suffix(".html")
         with path.open("wb") as file:
-            ply.write(file, point, DEFAULTS)
-        command = [npx, "--yes", VIEWER, "--quiet", "--gpu", "cpu", str(path), str(path.with_suffix(".html"))]
+            ply.write(file, _single_gaussian(), DEFAULTS)
+        command = [npx, "--yes", VIEWER, "--quiet", "--gpu", "cpu", str(path), str(page)]
         try:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=folder)
-            return path.with_suffix(".html").read_bytes()
+            return page.read_bytes()
         except subprocess.TimeoutExpired as error:
             raise InputError(f"`npx {VIEWER}` took more than {_SECONDS} s: {remedy}.") from error
         except (subprocess.CalledProcessError, OSError) as error:
-            said = error.stderr.strip() if isinstance(error, subprocess.CalledProcessError) else ""
-            what = said.splitlines()[-1] if said else reason(error)
-            raise InputError(f"`npx {VIEWER}` failed ({what}): {remedy}.") from error
+            raise InputError(f"`npx {VIEWER}` failed ({_cause(error)}): {remedy}.") from error
+
+
+def _single_gaussian() -> Gaussians:
+    zeros = np.zeros((1, 3), np.float32)
+    return Gaussians(
+        means=zeros,
+        scales=zeros - 5,
+        quats=np.eye(1, 4, dtype=np.float32),
+        opacities=zeros[:, 0],
+        features_dc=zeros,
+        features_rest=np.zeros((1, 0, 3), np.float32),
+    )
+
+
+def _cause(error: Exception) -> str:
+    """Return why a program failed: the last line that it printed, or else the reason of the error."""
+    if isinstance(error, subprocess.CalledProcessError):
+        lines = error.stderr.strip().splitlines()
+        if lines:
+            return lines[-1]
+    return reason(error)
 
 
 def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, means: NDArray[np.float32]) -> Start:
@@ -102,8 +131,12 @@ def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, mean
     """
     position = camera_to_world[:, 3]
     forward = -camera_to_world[:, 2]
-    depths = (means - position) @ forward
-    across = np.linalg.norm(means - position - depths[:, None] * forward, axis=1)
-    middle = depths[across < 0.2 * depths]
-    target = position + forward * (np.median(middle) if len(middle) else 1.0)
-    return Start(tuple(position.tolist()), tuple(target.tolist()), math.degrees(2 * math.atan(side / (2 * focal))))
+    depths = (means - position) @ forward  # [N]
+    across = np.linalg.norm(means - position - depths[:, None] * forward, axis=1)  # [N]
+    middle_depths = depths[across < 0.2 * depths]
+    distance = 1.0
+    if len(middle_depths):
+        distance = np.median(middle_depths)
+    target = position + forward * distance
+    angle = 2 * math.atan(side / (2 * focal))
+    return Start(tuple(position.tolist()), tuple(target.tolist()), math.degrees(angle))

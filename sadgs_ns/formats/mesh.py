@@ -81,17 +81,29 @@ class Fusion:
 
     def has_room_for(self, views: Sequence[DepthView]) -> bool:
         """Return whether these views need at most a quarter of `MOST_VOXELS`; the rest is for other views."""
-        found = [blocks[0].numpy() for view in views if (blocks := self._blocks(view)) is not None]
-        return not found or 4 * len(np.unique(np.concatenate(found), axis=0)) * _RESOLUTION**3 <= MOST_VOXELS
+        of_views = []
+        for view in views:
+            found = self._blocks(view)
+            if found is not None:
+                blocks, _ = found
+                of_views.append(blocks.numpy())
+        if not of_views:
+            return True
+        distinct = np.unique(np.concatenate(of_views), axis=0)
+        return 4 * len(distinct) * _RESOLUTION**3 <= MOST_VOXELS
 
     def add(self, view: DepthView) -> None:
         """Fuse a view; raise InputError if that takes more than `MOST_VOXELS`."""
         self._views += 1
-        if (found := self._blocks(view)) is None:
+        found = self._blocks(view)
+        if found is None:
             return
         blocks, camera = found
         voxels = self._grid.hashmap()
-        known = voxels.find(blocks)[1].numpy().sum() if voxels.size() else 0
+        known = 0
+        if voxels.size():
+            _, is_known = voxels.find(blocks)
+            known = is_known.numpy().sum()
         if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:
             problem = f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory"
             raise InputError(f"{problem}: give a larger one, such as --voxel-size {2 * self.voxel_size:.2g}.")
@@ -103,15 +115,18 @@ class Fusion:
         found = load_open3d().geometry.TriangleMesh()
         if self._grid.hashmap().size():
             # Open3D wants more views than the threshold says.
-            extracted = self._grid.extract_triangle_mesh(weight_threshold=min(_VIEWS, self._views) - 0.5)
-            found = extracted.to_legacy() if len(extracted.triangle) else found
+            threshold = min(_VIEWS, self._views) - 0.5
+            extracted = self._grid.extract_triangle_mesh(weight_threshold=threshold)
+            if len(extracted.triangle):
+                found = extracted.to_legacy()
         return without_small_parts(found)
 
 
 def without_small_parts(mesh: TriangleMesh) -> TriangleMesh:
     """Remove connected components with less than a hundredth of the largest one's triangles, and return the mesh."""
     parts, sizes, _ = map(np.asarray, mesh.cluster_connected_triangles())
-    mesh.remove_triangles_by_mask(sizes[parts] < _SMALLEST_SHARE * sizes.max(initial=0))
+    is_small = sizes < _SMALLEST_SHARE * sizes.max(initial=0)
+    mesh.remove_triangles_by_mask(is_small[parts])
     return mesh.remove_unreferenced_vertices()
 
 
@@ -120,7 +135,8 @@ def moved(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
     transform = np.eye(4)
     transform[:3] = np.c_[similarity.scale * similarity.orthogonal, similarity.translation]
     if np.linalg.det(similarity.orthogonal) < 0:
-        mesh.triangles = type(mesh.triangles)(np.asarray(mesh.triangles)[:, ::-1])
+        reversed_corners = np.asarray(mesh.triangles)[:, ::-1]
+        mesh.triangles = type(mesh.triangles)(reversed_corners)
     return mesh.transform(transform)
 
 
@@ -138,14 +154,18 @@ def write(file: IO[bytes], mesh: TriangleMesh) -> None:
     """Write a mesh as binary little-endian PLY, with colours. Open3D's own writer takes a full disk for success."""
     vertices = np.empty(len(mesh.vertices), [("position", "<f4", 3), ("color", "u1", 3)])
     vertices["position"] = mesh.vertices
-    vertices["color"] = np.rint(255 * np.asarray(mesh.vertex_colors).clip(0, 1))
+    colors = np.asarray(mesh.vertex_colors).clip(0, 1)
+    vertices["color"] = np.rint(255 * colors)
     faces = np.empty(len(mesh.triangles), [("corners", "u1"), ("indices", "<i4", 3)])
     faces["corners"] = 3
     faces["indices"] = mesh.triangles
     lines = ["ply", "format binary_little_endian 1.0", "comment sadgs_ns: fused from rendered depth"]
-    lines += [f"element vertex {len(vertices)}", *(f"property float {axis}" for axis in "xyz")]
+    lines.append(f"element vertex {len(vertices)}")
+    lines += [f"property float {axis}" for axis in "xyz"]
     lines += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
-    file.write(("\n".join(lines) + "\n").encode())
+    lines.append(f"element face {len(faces)}")
+    lines.append("property list uchar int vertex_indices")
+    lines.append("end_header\n")
+    file.write("\n".join(lines).encode())
     file.write(vertices.tobytes())
     file.write(faces.tobytes())

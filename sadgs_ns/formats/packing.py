@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
@@ -13,17 +12,23 @@ _LEVELS = 256  # Levels of a codebook, as many as a byte tells apart
 _BINS = 256  # Bins of the histogram from which a codebook begins
 _SAMPLE = 1 << 18  # Values that a codebook is made of
 _ROUNDS = 20  # Rounds in which a codebook's levels move to the means of their values
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""The other three components, for each component of a quaternion. [4, 3]"""
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the order [N] of positions [N, 3] along a curve that keeps neighbours together."""
     low = means.min(axis=0)
     high = means.max(axis=0)
-    cells = (means - low) / np.maximum(high - low, 1e-30).astype(np.float64)
-    coordinates = (cells * ((1 << _BITS) - 1)).astype(np.int64).T  # [3, N]
+    span = np.maximum(high - low, 1e-30).astype(np.float64)
+    shares = (means - low) / span
+    most = (1 << _BITS) - 1
+    coordinates = (shares * most).astype(np.int64).T  # [3, N]
     codes = np.zeros(len(means), np.int64)
-    for bit, (axis, values) in itertools.product(range(_BITS), enumerate(coordinates)):
-        codes |= (values >> bit & 1) << (3 * bit + axis)
+    for bit in range(_BITS):
+        for axis, values in enumerate(coordinates):
+            bits = values >> bit & 1
+            codes |= bits << (3 * bit + axis)
     return np.argsort(codes, kind="stable")
 
 
@@ -35,8 +40,9 @@ def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArr
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
     signs = np.where(quats[rows, largest] < 0, np.float32(-1), np.float32(1))
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
-    return largest, quats[rows[:, None], others] * signs[:, None]
+    columns = _OTHERS[largest]  # [N, 3]
+    others = quats[rows[:, None], columns]
+    return largest, others * signs[:, None]
 
 
 def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -47,19 +53,25 @@ def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """
     counts, edges = np.histogram(values, _BINS)
     density = np.cbrt(counts)
-    mass = np.concatenate([[0.0], np.cumsum(density + 0.25 * density.mean())])
-    values = values.flatten()[:: math.ceil(values.size / _SAMPLE)]
-    levels = np.interp((np.arange(_LEVELS) + 0.5) / _LEVELS * mass[-1], mass, edges)
+    mixture = density + 0.25 * density.mean()
+    mass = np.concatenate([[0.0], np.cumsum(mixture)])
+    step = math.ceil(values.size / _SAMPLE)
+    sample = values.flatten()[::step]
+    places = (np.arange(_LEVELS) + 0.5) / _LEVELS * mass[-1]
+    levels = np.interp(places, mass, edges)
     for _ in range(_ROUNDS):
-        labels = nearest_level(values, levels)
+        labels = nearest_level(sample, levels)
         numbers = np.bincount(labels, minlength=_LEVELS)
-        levels = np.where(numbers > 0, np.bincount(labels, values, _LEVELS) / np.maximum(numbers, 1), levels)
+        sums = np.bincount(labels, sample, _LEVELS)
+        means = sums / np.maximum(numbers, 1)
+        levels = np.where(numbers > 0, means, levels)
     return levels.astype(np.float32)
 
 
 def nearest_level(values: NDArray[np.floating], levels: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Return the index of the nearest level, of at most 256 ascending ones. [...] → [...]"""
-    return np.searchsorted((levels[1:] + levels[:-1]) / 2, values).astype(np.uint8)
+    borders = (levels[1:] + levels[:-1]) / 2
+    return np.searchsorted(borders, values).astype(np.uint8)
 
 
 def to_bytes(values: NDArray[np.number]) -> NDArray[np.uint8]:

@@ -35,37 +35,41 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     logs = np.sign(gaussians.means) * np.log1p(np.abs(gaussians.means.astype(np.float64)))
     low = logs.min(axis=0)
     high = logs.max(axis=0)
-    positions = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    span = np.where(high > low, high - low, 1)
+    positions = np.rint((logs - low) / span * 65535).astype(np.uint16)
     largest, others = smallest_three(gaussians.quats)
-    rotations = np.c_[to_bytes(255 * (others * math.sqrt(0.5) + 0.5)), (252 + largest).astype(np.uint8)]
-    scales = codebook(gaussians.scales)
-    colors = codebook(gaussians.features_dc)
+    other_bytes = to_bytes(255 * (others * math.sqrt(0.5) + 0.5))
+    largest_bytes = (252 + largest).astype(np.uint8)
+    scale_levels = codebook(gaussians.scales)
+    color_levels = codebook(gaussians.features_dc)
+    colors = nearest_level(gaussians.features_dc, color_levels)
     alphas = to_bytes(255 * sigmoid(gaussians.opacities))
     images = {
-        "means_l": (positions & 255).astype(np.uint8),
-        "means_u": (positions >> 8).astype(np.uint8),
-        "quats": rotations,
-        "scales": nearest_level(gaussians.scales, scales),
-        "sh0": np.c_[nearest_level(gaussians.features_dc, colors), alphas],
+        "means_l": _image((positions & 255).astype(np.uint8), width),
+        "means_u": _image((positions >> 8).astype(np.uint8), width),
+        "quats": _image(np.c_[other_bytes, largest_bytes], width),
+        "scales": _image(nearest_level(gaussians.scales, scale_levels), width),
+        "sh0": _image(np.c_[colors, alphas], width),
     }
-    images = {name: _image(pixels, width) for name, pixels in images.items()}
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "sadgs_ns"},
         "count": count,
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": scales.tolist(), "files": ["scales.webp"]},
+        "scales": {"codebook": scale_levels.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
-        "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
+        "sh0": {"codebook": color_levels.tolist(), "files": ["sh0.webp"]},
     }
     if gaussians.degree:
+        bands = gaussians.features_rest.shape[1]
         sets, labels = palette(gaussians.features_rest.reshape(count, -1))
         levels = codebook(sets)
-        sets = nearest_level(sets, levels).reshape(-1, 3)
-        images["shN_centroids"] = _image(sets, _SETS_A_ROW * gaussians.features_rest.shape[1])
-        images["shN_labels"] = _image(np.stack([labels & 255, labels >> 8, 0 * labels], 1).astype(np.uint8), width)
+        centroids = nearest_level(sets, levels).reshape(-1, 3)
+        label_bytes = np.stack([labels & 255, labels >> 8, 0 * labels], axis=1)  # [N, 3]
+        images["shN_centroids"] = _image(centroids, _SETS_A_ROW * bands)
+        images["shN_labels"] = _image(label_bytes.astype(np.uint8), width)
         meta["shN"] = {
-            "count": len(sets) // gaussians.features_rest.shape[1],
+            "count": len(sets),
             "bands": gaussians.degree,
             "codebook": levels.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
@@ -74,8 +78,10 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
         for name, image in images.items():
             encoded = io.BytesIO()
             image.save(encoded, "webp", lossless=True, exact=True, quality=50, method=4)
-            archive.writestr(zipfile.ZipInfo(f"{name}.webp"), encoded.getvalue())
-        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+            entry = zipfile.ZipInfo(f"{name}.webp")
+            archive.writestr(entry, encoded.getvalue())
+        entry = zipfile.ZipInfo("meta.json")
+        archive.writestr(entry, json.dumps(meta))
 
 
 def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
@@ -83,7 +89,8 @@ def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
     height = math.ceil(len(pixels) / width)
     whole = np.zeros((height * width, 4), np.uint8)
     whole[:, 3] = 255
-    whole[: len(pixels), : pixels.shape[1]] = pixels
+    number, channels = pixels.shape
+    whole[:number, :channels] = pixels
     return Image.fromarray(whole.reshape(height, width, 4))
 
 
@@ -95,20 +102,25 @@ def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
     """
     number = min(_PALETTE, len(vectors) // 2 + 1)
     generator = np.random.default_rng(0)
-    sample = vectors if len(vectors) <= _SAMPLE else vectors[generator.choice(len(vectors), _SAMPLE, replace=False)]
+    sample = vectors
+    if len(vectors) > _SAMPLE:
+        chosen = generator.choice(len(vectors), _SAMPLE, replace=False)
+        sample = vectors[chosen]
     coarse = _k_means(sample, math.isqrt(number), generator)
-    belongs = np.concatenate([_nearest(part, coarse) for part in np.array_split(vectors, len(vectors) // _SAMPLE + 1)])
+    parts = np.array_split(vectors, len(vectors) // _SAMPLE + 1)
+    belongs = np.concatenate([_nearest(part, coarse) for part in parts])
     centers = []
     labels = np.empty(len(vectors), np.int64)
     used = 0
     for cluster in range(len(coarse)):
-        members = (belongs == cluster).nonzero()[0]
-        if len(members):
-            share = max(number * len(members) // len(vectors) - 1, 1)  # Rounding up must not exceed the palette.
-            fine = _k_means(vectors[members], share, generator)
-            labels[members] = used + _nearest(vectors[members], fine)
-            centers.append(fine)
-            used += len(fine)
+        (members,) = (belongs == cluster).nonzero()
+        if not len(members):
+            continue
+        share = max(number * len(members) // len(vectors) - 1, 1)  # Rounding up must not exceed the palette.
+        fine = _k_means(vectors[members], share, generator)
+        labels[members] = used + _nearest(vectors[members], fine)
+        centers.append(fine)
+        used += len(fine)
     return np.concatenate(centers), labels
 
 
@@ -116,14 +128,17 @@ def _k_means(vectors: NDArray[np.float32], number: int, generator: np.random.Gen
     """Return centres of at least as many vectors. [N, D] → [number, D]"""
     from scipy.cluster.vq import kmeans2  # It takes a third of a second to import.
 
-    start = vectors[generator.choice(len(vectors), number, replace=False)]
+    chosen = generator.choice(len(vectors), number, replace=False)
+    start = vectors[chosen]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Of clusters that became empty, which keep their centre.
-        return kmeans2(vectors, start, _ROUNDS, minit="matrix")[0].astype(np.float32)
+        centers, _ = kmeans2(vectors, start, _ROUNDS, minit="matrix")
+    return centers.astype(np.float32)
 
 
 def _nearest(vectors: NDArray[np.float32], centers: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return the index of each vector's nearest centre. [N, D], [M, D] → [N]"""
     from scipy.cluster.vq import vq
 
-    return vq(vectors, centers, check_finite=False)[0]
+    indices, _ = vq(vectors, centers, check_finite=False)
+    return indices

@@ -38,32 +38,40 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
     """Write at least one Gaussian as SPZ; raise InputError if positions would be coarse, or most scales cut."""
     median = float(np.median(gaussians.scales))
     if not -10 < median < 5.94:
-        told = f"Most Gaussians' axes, about {math.exp(median):.1g} units, are beyond the 5e-5 to 380 that SPZ holds"
-        raise InputError(f"{told}: choose another format.")
+        problem = f"Most Gaussians' axes, about {math.exp(median):.1g} units, are beyond the 5e-5 to 380 that SPZ holds"
+        raise InputError(f"{problem}: choose another format.")
     bits = _fractional_bits(float(np.abs(gaussians.means).max()))
-    fixed = np.rint(gaussians.means * np.float64(1 << bits)).clip(1 - _RANGE, _RANGE - 1).astype("<i4")
-    largest, others = smallest_three(gaussians.quats[:, [1, 2, 3, 0]])
-    magnitudes = np.rint(np.abs(others) * (511 * math.sqrt(2))).clip(0, 511).astype("<u4") | (others < 0) << 9
-    rotations = largest.astype("<u4") << 30 | magnitudes[:, 0] << 20 | magnitudes[:, 1] << 10 | magnitudes[:, 2]
-    parts: list[NDArray[np.uint8]] = [
-        fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3],
-        to_bytes(255 * sigmoid(gaussians.opacities)),
-        to_bytes(_COLOR * gaussians.features_dc + 127.5),
-        to_bytes(16 * (gaussians.scales + 10)),
-        rotations.astype("<u4").view(np.uint8),
-        to_bytes(128 + _STEP * np.rint(128 / _STEP * gaussians.features_rest)),
-    ]
+    steps = np.rint(gaussians.means * np.float64(1 << bits))
+    fixed = steps.clip(1 - _RANGE, _RANGE - 1).astype("<i4")  # [N, 3]
+    positions = fixed.view(np.uint8).reshape(-1, 3, 4)[:, :, :3]  # The lower 24 of 32 bits
+    alphas = to_bytes(255 * sigmoid(gaussians.opacities))
+    colors = to_bytes(_COLOR * gaussians.features_dc + 127.5)
+    scales = to_bytes(16 * (gaussians.scales + 10))
+    rotations = _pack_rotations(gaussians.quats).view(np.uint8)
+    harmonics = to_bytes(128 + _STEP * np.rint(128 / _STEP * gaussians.features_rest))
+    header = struct.pack("<IIIBBBB", _MAGIC, _VERSION, len(gaussians), gaussians.degree, bits, _HAS_RECORDS, 0)
     with gzip.GzipFile(fileobj=file, mode="wb", compresslevel=6, mtime=0) as compressed:
-        counts = len(gaussians), gaussians.degree, bits
-        compressed.write(struct.pack("<IIIBBBB", _MAGIC, _VERSION, *counts, _HAS_RECORDS, 0))
-        for part in parts:
+        compressed.write(header)
+        for part in (positions, alphas, colors, scales, rotations, harmonics):
             compressed.write(part.tobytes())
         compressed.write(_AXES)
 
 
+def _pack_rotations(quats: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Pack quaternions, wxyz: the largest component's index, and 9 bits and a sign of each other. [N, 4] → [N]"""
+    xyzw = quats[:, [1, 2, 3, 0]]
+    largest, others = smallest_three(xyzw)
+    magnitudes = np.rint(np.abs(others) * (511 * math.sqrt(2))).clip(0, 511).astype("<u4")
+    signs = (others < 0) << 9
+    first, second, third = (magnitudes | signs).T  # [N] each
+    packed = largest.astype("<u4") << 30 | first << 20 | second << 10 | third
+    return packed.astype("<u4")
+
+
 def _fractional_bits(reach: float) -> int:
-    """Return how many of a position's 23 bits can be behind the point."""
-    bits = min(_MOST_BITS, 22 - math.floor(math.log2(max(reach, 1e-6))))
+    """Return how many of a position's 23 bits can be behind the point; raise InputError if they are too few."""
+    bits_before_the_point = math.floor(math.log2(max(reach, 1e-6))) + 1
+    bits = min(_MOST_BITS, 23 - bits_before_the_point)
     if bits < _LEAST_BITS:
         raise InputError(
             f"The Gaussians reach {reach:,.0f} units from the origin, so that SPZ would hold positions in steps "

@@ -7,6 +7,7 @@ import filecmp
 import math
 import os
 import re
+import struct
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -25,6 +26,11 @@ COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the 
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
+_UNREADABLE = (
+    OSError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow raises where an image is damaged. Only its functions are called where this is caught, so that a mistake
+in others is not taken for damage."""
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
@@ -156,7 +162,7 @@ def _kind(path: Path) -> str:
         start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
         return "photos"
-    with contextlib.suppress(Exception), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
+    with contextlib.suppress(*_UNREADABLE), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
         kind = image.format
     if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
         return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
@@ -171,21 +177,28 @@ def _stem(name: str) -> str:
 
 def _is_mask(path: Path) -> bool:
     """Return whether an image has two colours at most, or nearly all of it is black or white."""
-    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged image is named when it is read.
-        pixels = np.asarray(image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)).reshape(-1, 3)
-        is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
-        return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
-    return False
+    try:
+        with Image.open(path) as image:
+            small = image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)
+    except _UNREADABLE:  # A damaged image is named when it is read.
+        return False
+    pixels = np.asarray(small).reshape(-1, 3)
+    is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
+    return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
 
 
 def _is_swept(path: Path) -> bool:
     """Return whether a photo says that it is a panorama, but not of all directions: no lens shows it."""
-    with contextlib.suppress(Exception), Image.open(path) as image:  # A damaged photo is named when it is read.
-        is_whole = image.width == 2 * image.height
-        lens = Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
-        by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
-        return not is_whole and (by_apple or b"GPano:" in image.info.get("xmp", b""))
-    return False
+    try:
+        with Image.open(path) as image:
+            size = image.size
+            lens = Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
+            xmp = image.info.get("xmp", b"")
+    except _UNREADABLE:  # A damaged photo is named when it is read.
+        return False
+    is_whole = size[0] == 2 * size[1]
+    by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
+    return not is_whole and (by_apple or b"GPano:" in xmp)
 
 
 def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list[str]:
@@ -209,16 +222,26 @@ def _is_copy(photo: Path, other: Path) -> bool:
     """Return whether photos are equal, or have one name and differ in size, format or tone alone."""
     if filecmp.cmp(photo, other, shallow=False):
         return True
-    # A damaged photo is named when it is read.
-    with contextlib.suppress(Exception), Image.open(photo) as one, Image.open(other) as two:
-        is_rig = one.size == two.size and photo.parent != other.parent and photo.suffix == other.suffix
-        if is_rig or _stem(photo.name) != _stem(other.name):
-            return False
-        one.draft("L", (64, 64))
-        two.draft("L", (64, 64))
-        a, b = (ImageOps.exif_transpose(image).convert("L") for image in (one, two))
-        small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (a, b)]
-        with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
-            is_alike = np.corrcoef(small)[0, 1] > 0.99  # Smaller copies of photos reach .999.
-        return bool(is_alike and 0.97 < a.width * b.height / (a.height * b.width) < 1.03)
-    return False
+    if _stem(photo.name) != _stem(other.name):
+        return False
+    is_rig = photo.parent != other.parent and photo.suffix == other.suffix and image_size(photo) == image_size(other)
+    if is_rig:
+        return False
+    one = _read_grey(photo)
+    two = _read_grey(other)
+    if one is None or two is None:
+        return False
+    small = [np.ravel(np.asarray(image.resize((16, 16), Image.Resampling.HAMMING))) for image in (one, two)]
+    with np.errstate(invalid="ignore", divide="ignore"):  # of one colour
+        is_alike = np.corrcoef(small)[0, 1] > 0.99  # Smaller copies of photos reach .999.
+    return bool(is_alike and 0.97 < one.width * two.height / (one.height * two.width) < 1.03)
+
+
+def _read_grey(path: Path) -> Image.Image | None:
+    """Return a small grey version of a photo, upright, or None if it is damaged, as is said when it is read."""
+    try:
+        with Image.open(path) as image:
+            image.draft("L", (64, 64))
+            return ImageOps.exif_transpose(image).convert("L")
+    except _UNREADABLE:
+        return None

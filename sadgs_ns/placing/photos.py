@@ -7,7 +7,7 @@ import dataclasses
 import os
 import re
 import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -25,6 +25,8 @@ from sadgs_ns.placing.panoramas import VIEWS, is_panorama
 
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
 """Of a phone's digital zoom one of the last two alone tells, by its make."""
+_NO_FOCAL_LENGTH = ("None", "nan")  # A focal length in `Photo.camera` that EXIF does not tell
+_LARGE_FOLDER = 10  # Least number of photos of a folder that has a camera of its own
 _NAMED = 20  # How many unreadable photos a message names
 
 
@@ -39,6 +41,7 @@ class Photo:
     is_read: bool = True  # Whether COLMAP reads its format, and its colours need no conversion
     is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
     is_panorama: bool = False
+    has_focal_length: bool = False  # Whether EXIF tells one
     largest_value: int | None = None  # Of its colours if its file has more than 8 bits a value
     bit_depth: int | None = None  # Bits that its values use if these are to be scaled
 
@@ -126,6 +129,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
             size = (height, width)
         lens = exif.get_ifd(ExifTags.IFD.Exif)
         focals = [str(lens.get(tag) or None) for tag in _FOCAL_LENGTHS]  # as text: 0/0 is not equal to itself
+        has_focal_length = any(focal not in _NO_FOCAL_LENGTH for focal in focals[:2])
         camera = (size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals)
         has_alpha = image.has_transparency_data
         is_read = image.format in COLMAP_FORMATS and image.mode not in ("CMYK", "LAB")  # A TIFF would stay CMYK.
@@ -140,8 +144,9 @@ def _read_photo(folder: Path, name: str) -> Photo:
         image.draft("RGB", (draft_width, draft_height))
         image.load()
         is_turned = orientation in NOT_UPRIGHT
+        is_whole_view = is_panorama(image, size)
         largest = largest_value(image, folder / name)
-        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_panorama(image, size), largest)
+        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_whole_view, has_focal_length, largest)
 
 
 def empty_folder(folder: Path) -> Path:
@@ -152,11 +157,34 @@ def empty_folder(folder: Path) -> Path:
 
 
 def photos_by_camera(photos: Sequence[Photo]) -> list[list[str]]:
-    """Group the names of photos by their camera."""
+    """Group the names of photos by their camera, as far as size and EXIF tell."""
     groups: dict[tuple, list[str]] = defaultdict(list)
     for photo in photos:
         groups[photo.camera].append(photo.name)
     return list(groups.values())
+
+
+def photos_by_camera_and_folder(photos: Sequence[Photo]) -> list[list[str]]:
+    """Group the names of photos as `photos_by_camera` does, and by folder where EXIF tells no focal length.
+
+    Two cameras of one size often have a folder each. Folders of fewer than ten photos tell too little of a camera: they
+    share one, and where a single folder has more, they share its camera.
+    """
+    counts = Counter((photo.camera, _folder(photo)) for photo in photos)
+    large_folders = Counter(camera for (camera, _), count in counts.items() if count >= _LARGE_FOLDER)
+    groups: dict[tuple, list[str]] = defaultdict(list)
+    for photo in photos:
+        folder = ""
+        is_large = counts[photo.camera, _folder(photo)] >= _LARGE_FOLDER
+        if is_large and large_folders[photo.camera] > 1 and not photo.has_focal_length:
+            folder = f"{_folder(photo)}/"
+        groups[(photo.camera, folder)].append(photo.name)
+    return list(groups.values())
+
+
+def _folder(photo: Photo) -> str:
+    """Return the folder of a photo, relative to the folder of all."""
+    return os.path.dirname(photo.name)
 
 
 def in_order(names: Sequence[str]) -> list[str]:

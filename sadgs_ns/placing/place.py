@@ -16,7 +16,13 @@ from sadgs_ns.placing.conversion import convert_photos, write_alpha, write_masks
 from sadgs_ns.placing.folder import find_videos
 from sadgs_ns.placing.options import PlacingOptions, Report, Say
 from sadgs_ns.placing.panoramas import VIEWS
-from sadgs_ns.placing.photos import Photo, empty_folder, photos_by_camera, read_photos
+from sadgs_ns.placing.photos import (
+    Photo,
+    empty_folder,
+    photos_by_camera,
+    photos_by_camera_and_folder,
+    read_photos,
+)
 from sadgs_ns.placing.plan import Summary, choose_matching
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.scene import Scene
@@ -36,7 +42,8 @@ def place_photos(options: PlacingOptions, report: Report, say: Say) -> Placed:
     """Find the poses of photos, or of frames of a video, and write a scene for training.
 
     A run that was interrupted is resumed. New photos are added to a finished scene, whose other cameras stay as they
-    are. If fewer than half of the photos register, the scene is written, but it does not count as finished.
+    are. If fewer than half of the photos register, or the cameras are wrong, the scene is written, but it does not
+    count as finished.
 
     Raise InputError if the photos, the folder or the settings cannot be used, OSError if a file cannot be written,
     and RunError if COLMAP fails. The work so far is kept then, and also if an interrupt is raised.
@@ -78,8 +85,9 @@ def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
             shutil.rmtree(scene.model, ignore_errors=True)
             shutil.rmtree(scene.work / "photos", ignore_errors=True)
         folder, converted = _convert(scene, folder, photos, say)
-        groups, rigs = _group_by_camera(scene, photos, converted)
-        arguments = (folder, groups, matching, scene.options.max_size, scene.model, scene.base, rigs)
+        groups, alike = _group_by_camera(scene, converted)
+        rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
+        arguments = (folder, groups, matching, scene.options.max_size, scene.model, scene.base, rigs, alike)
         summary = Summary(**make_model(colmap, *arguments, folder=scene.work, report=report))
         publish(scene.work / "undistorted", scene.options.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
@@ -203,17 +211,9 @@ def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> t
     return converted, photos
 
 
-def _group_by_camera(
-    scene: Scene, photos: Sequence[Photo], converted: Sequence[Photo]
-) -> tuple[list[list[str]], list[list[str]]]:
-    """Return the names of the photos by camera, and of the views by panorama."""
-    rigs = []
-    for photo in photos:
-        if photo.is_panorama:
-            rigs.append([view.name for view in photo.views])
-    others = [photo for photo in converted if photo.camera]  # Views of panoramas have none.
+def _group_by_camera(scene: Scene, photos: Sequence[Photo]) -> tuple[list[list[str]], list[list[str]]]:
+    """Return the names of the photos that have a camera for themselves, and of those whose cameras may be one."""
+    others = [photo for photo in photos if photo.camera]  # Views of panoramas have none.
     if scene.options.camera_per_photo:
-        groups = [[photo.name] for photo in others]
-    else:
-        groups = photos_by_camera(others)
-    return groups, rigs
+        return [[photo.name] for photo in others], []
+    return photos_by_camera_and_folder(others), photos_by_camera(others)

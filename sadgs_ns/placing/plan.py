@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 EXHAUSTIVE_LIMIT = 40  # Most photos for which every pair is matched; twice the photos take four times as long
@@ -12,7 +12,7 @@ Matching = Literal["auto", "exhaustive", "sequential", "similar"]
 
 @dataclass(frozen=True)
 class Summary:
-    """How many photos registered, and why others did not."""
+    """How many photos registered, why others did not, and what speaks against the cameras."""
 
     photos: int
     registered: int
@@ -21,6 +21,8 @@ class Summary:
     left_out: dict[str, str]  # The reason for each photo that did not register
     matching: Matching
     attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
+    doubts: list[str] = field(default_factory=list)  # Reasons why the cameras may be wrong, as in `Judgement`
+    faults: list[str] = field(default_factory=list)  # Reasons why they are wrong
 
     def __str__(self) -> str:
         registered = f"{self.registered} of {self.photos} photos registered, {self.points:,} points"
@@ -32,8 +34,8 @@ class Summary:
 
     @property
     def is_poor(self) -> bool:
-        """Whether fewer than half of the photos registered."""
-        return self.registered < 0.5 * self.photos
+        """Whether fewer than half of the photos registered, or the cameras are wrong."""
+        return self.registered < 0.5 * self.photos or bool(self.faults)
 
 
 def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:

@@ -16,7 +16,7 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -26,6 +26,8 @@ from sadgs_ns.events import progress
 from sadgs_ns.placing.adjustment import adjust_robustly, refine
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
+from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
+from sadgs_ns.placing.judgement import judge, measure
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
@@ -59,7 +61,7 @@ FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
 
 def make_model(
     photos: Path, groups: Sequence[Sequence[str]], matching: Matching, max_size: int, model: Path, base: Path | None,
-    rigs: Sequence[Sequence[str]],
+    rigs: Sequence[Sequence[str]], alike: Sequence[Sequence[str]] = (),
 ) -> Summary:  # fmt: skip
     """Make a model of photos, and from it the undistorted scene in the folder `undistorted` beside it.
 
@@ -73,6 +75,7 @@ def make_model(
         model: The model's folder. Beside it lie `write_alpha`'s and `write_masks`' files, and what a stopped run left.
         base: An earlier model's folder, to which photos are added; these alone are undistorted, and its cameras stay.
         rigs: The names of the views of each panorama.
+        alike: The names of photos whose groups differ in their folder alone, so that their cameras may be one.
     """
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
     names = sorted(itertools.chain(*groups, *rigs))
@@ -81,7 +84,7 @@ def make_model(
     if not model.exists():
         extract(photos, groups, database, rigs)
         match(names, database, matching, gpu.result(), rigs)
-        place_cameras(photos, names, database, model, base)
+        place_cameras(photos, names, database, model, base, alike)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
     made = pycolmap.Reconstruction(model)
     undistorted = model.with_name("undistorted")
@@ -188,22 +191,29 @@ def match(
     progress(stage, len(pairs), len(pairs))
 
 
-def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> None:
-    """Estimate cameras and points, and write the model with the most photos; its folder appears when it is complete.
+def place_cameras(
+    photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None,
+    alike: Sequence[Sequence[str]] = (),
+) -> None:  # fmt: skip
+    """Estimate cameras and points, and write the best model; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
-    new photos, and photos that did not register before are tried again. Raise InputError if none could be related.
+    new photos, and photos that did not register before are tried again. Cameras of photos that are `alike`, as of
+    `make_model`, are joined if they are one and the model suffices. Raise InputError if no photos could be related.
     """
     search = _Search.of(photos, names, database, model, base)
     best = search.attempt("cameras", {})
     attempts = ""
-    if not search.quality(best)[0]:
+    quality = search.quality(best)
+    if not quality.suffices:
         second = search.attempt("cameras (relaxed)", _RELAXED)
+        second_quality = search.quality(second)
         attempts = (
-            f"A first attempt registered {search.quality(best)[1]}, one with relaxed limits "
-            f"{search.quality(second)[1]}."
+            f"A first attempt registered {quality.registered}, one with relaxed limits {second_quality.registered}."
         )
-        best = max(best, second, key=search.quality)
+        if second_quality > quality:
+            best = second
+            quality = second_quality
     before = search.before
     if before is None and best is None:
         raise InputError(_unrelated(names, database))
@@ -212,6 +222,12 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
             "none of the photos that were added could be related to the others: take some that share two thirds of "
             "what they show with each other and with those that are there, or take these out of the folder again."
         )
+    joined: dict[int, int] = {}
+    if quality.suffices:
+        joined = same_cameras(best, alike, search.fixed_cameras)
+    if joined:
+        best = join_cameras(best, joined)
+        adjust_robustly(best, search.fixed_cameras, search.held_frames)
     for frame_id in search.held_frames:  # COLMAP rounds poses that it holds fixed.
         assert before is not None
         best.frames[frame_id].rig_from_world = before.frames[frame_id].rig_from_world
@@ -220,8 +236,18 @@ def place_cameras(photos: Path, names: Sequence[str], database: Path, model: Pat
     best.write(partial)
     check_written(partial, best)
     (partial / "attempts.txt").write_text(attempts)
+    if joined:  # Photos that are added later find their folder's camera in the database.
+        join_in_database(database, joined)
     partial.rename(model)
     progress("cameras", search.total, search.total)
+
+
+class _Quality(NamedTuple):
+    """Compares models: one that is not wrong first, then one that suffices, then the one with more photos."""
+
+    is_possible: bool  # Whether nothing says that it is wrong
+    suffices: bool  # Whether no other attempt is needed
+    registered: int
 
 
 @dataclass(frozen=True)
@@ -269,7 +295,7 @@ class _Search:
         return options
 
     def attempt(self, stage: str, limits: Mapping[str, float]) -> pycolmap.Reconstruction | None:
-        """Place the cameras with some limits, and return the model with the most photos, or None without any."""
+        """Place the cameras with some limits, and return the best model, or None without any."""
         registered = 0
         if self.before is not None:
             registered = self.before.num_reg_frames()
@@ -295,22 +321,28 @@ class _Search:
                 initial_image_pair_callback=lambda: advance(2),
                 next_image_callback=lambda: advance(1),
             )
-        largest = max(models.values(), key=lambda candidate: candidate.num_reg_images(), default=None)
-        if largest is not None:
-            if self.before is None:
-                free_all_parameters(largest)
-                refine(largest, self.database, options)
-            adjust_robustly(largest, self.fixed_cameras, self.held_frames)
-        return largest
+        candidates = [model for model in models.values() if model.num_points3D() > 0]
+        best = max(candidates, key=self.quality, default=None)
+        if best is None:
+            return None
+        if self.before is None:
+            free_all_parameters(best)
+            refine(best, self.database, options)
+        adjust_robustly(best, self.fixed_cameras, self.held_frames)
+        if best.num_points3D() == 0:  # None fits with all parameters.
+            return None
+        return best
 
-    def quality(self, candidate: pycolmap.Reconstruction | None) -> tuple[bool, int]:
-        """Tell whether an attempt suffices, and how many photos it registered."""
+    def quality(self, candidate: pycolmap.Reconstruction | None) -> _Quality:
+        """Tell whether a model can be right, whether it suffices, and how many photos it registered."""
         if candidate is None:
-            return False, 0
+            return _Quality(False, False, 0)
         count = candidate.num_reg_images()
         cameras = [image.camera for image in candidate.images.values()]
         stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
-        return bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH), count
+        is_enough = bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH)
+        judgement = judge(measure(candidate))
+        return _Quality(not judgement.faults, is_enough and judgement.is_sound, count)
 
 
 def _unrelated(names: Sequence[str], database: Path) -> str:
@@ -320,7 +352,8 @@ def _unrelated(names: Sequence[str], database: Path) -> str:
         poor = sum(opened.num_keypoints_for_image(image.image_id) < FEW_FEATURES for image in images)
     return (
         f"no two photos could be related to each other ({poor} of {len(names)} have fewer than {FEW_FEATURES} "
-        "features); take more of them, with at least two thirds of overlap, sharp, and of a scene with texture."
+        "features); take more of them, from different places, with at least two thirds of overlap, sharp, and of a "
+        "scene with texture."
     )
 
 
@@ -346,7 +379,7 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 def summarize(
     names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
 ) -> Summary:
-    """Count the registered photos, and find out why the others are none."""
+    """Count the registered photos, find out why the others are none, and judge the model."""
     registered = registered_photos(model)
     left_out = {}
     with pycolmap.Database.open(database) as opened:
@@ -366,4 +399,8 @@ def summarize(
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()
-    return Summary(len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts)
+    judgement = judge(measure(model))
+    return Summary(
+        len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts, judgement.doubts,
+        judgement.faults,
+    )  # fmt: skip

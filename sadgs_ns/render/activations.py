@@ -21,5 +21,9 @@ def activate(
         from sadgs_ns.kernels.activations import activate as fused_activate
 
         return fused_activate(log_scales, logits, penalty)
-    opacities = torch.sigmoid(logits).squeeze(-1)
-    return torch.exp(log_scales), opacities, penalty * opacities.mean()[None] if penalty > 0 else None
+    scales = torch.exp(log_scales)
+    opacities = torch.sigmoid(logits).squeeze(-1)  # [N]
+    penalties = None
+    if penalty > 0:
+        penalties = penalty * opacities.mean()[None]  # [1]
+    return scales, opacities, penalties

@@ -28,8 +28,10 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
 
 def opacities_in_views(opacities: Tensor, num_views: int) -> Tensor:
     """Return opacities [N] once for each view. [C, N]"""
+    if num_views == 1:
+        return opacities[None]
     # Torch reduces the gradient of `expand` ten times as slowly as it adds.
-    return opacities[None] if num_views == 1 else torch.stack([opacities] * num_views)
+    return torch.stack([opacities] * num_views)
 
 
 def colors_in_views(

@@ -75,7 +75,9 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
     """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
     radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
     C = len(means2d)
-    extents = (radii if radii.dim() == means2d.dim() else radii[..., None].expand_as(means2d)).to(means2d.dtype)
+    if radii.dim() < means2d.dim():
+        radii = radii[..., None].expand_as(means2d)
+    extents = radii.to(means2d.dtype)  # [C, N, 2]
     tiles = _bin_into_tiles(means2d, depths, extents, width, height)
     rows = math.ceil(height / TILE_SIZE)
     columns = math.ceil(width / TILE_SIZE)
@@ -103,7 +105,8 @@ def _project(
     det = _determinant(covars2d)
     valid = valid & (det > 0)
     det = torch.where(valid, det, 1.0)
-    conics = torch.stack([covars2d[..., 1, 1], -covars2d[..., 0, 1], covars2d[..., 0, 0]], dim=-1) / det[..., None]
+    adjugates = torch.stack([covars2d[..., 1, 1], -covars2d[..., 0, 1], covars2d[..., 0, 0]], dim=-1)
+    conics = adjugates / det[..., None]
     return means2d, depths, conics, covars2d, valid
 
 
@@ -127,7 +130,9 @@ def _radii(means2d: Tensor, covars2d: Tensor, opacities: Tensor, valid: Tensor, 
     on_screen = ((means2d + extents > 0) & (means2d - extents < image)).all(dim=-1)
     # The ceiling keeps the radii of enormous Gaussians inside int32.
     radii = torch.where((valid & on_screen)[..., None], extents.clamp_max(1e9), 0.0).int()
-    return radii if RADII_PER_AXIS else radii[..., 0]
+    if not RADII_PER_AXIS:
+        return radii[..., 0]
+    return radii
 
 
 @torch.no_grad()
@@ -151,13 +156,15 @@ def _bin_into_tiles(
     reach = extents / TILE_SIZE
     low = (centers - reach).floor().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)  # [C, N, 2]
     high = (centers + reach).ceil().clamp(-1e9, 1e9).long().clamp_min(0).minimum(grid)
-    spans = (high - low) * visible[..., None]
-    counts = spans.prod(dim=-1).flatten()
+    spans = (high - low) * visible[..., None]  # [C, N, 2]
+    counts = spans.prod(dim=-1).flatten()  # [C * N]
     flatten_ids = torch.repeat_interleave(counts)  # [n_isects]
-    nth = torch.arange(len(flatten_ids), device=device) - (counts.cumsum(0) - counts)[flatten_ids]
+    starts = counts.cumsum(0) - counts  # [C * N]
+    nth = torch.arange(len(flatten_ids), device=device) - starts[flatten_ids]
     columns = spans.reshape(-1, 2)[flatten_ids, 0]
-    tile_x = low.reshape(-1, 2)[flatten_ids, 0] + nth % columns
-    tile_y = low.reshape(-1, 2)[flatten_ids, 1] + nth // columns
+    first_x, first_y = low.reshape(-1, 2)[flatten_ids].unbind(dim=1)
+    tile_x = first_x + nth % columns
+    tile_y = first_y + nth // columns
     tile_ids = tile_y * tile_width + tile_x
     camera_ids = flatten_ids // max(N, 1)
     # A key has the camera, the tile and the bits of the float32 depth, whose order is that of depths ≥ 0.
@@ -165,9 +172,11 @@ def _bin_into_tiles(
     keys = (camera_ids << (32 + n_tiles.bit_length())) | (tile_ids << 32) | depth_bits
     flatten_ids = flatten_ids[keys.argsort(stable=True)]
     per_tile = torch.bincount(camera_ids * n_tiles + tile_ids, minlength=C * n_tiles)  # [T]
-    tops, lefts = (TILE_SIZE * torch.arange(count, device=device) for count in (tile_height, tile_width))
+    offsets = per_tile.cumsum(0) - per_tile
+    tops = TILE_SIZE * torch.arange(tile_height, device=device)
+    lefts = TILE_SIZE * torch.arange(tile_width, device=device)
     origins = torch.cartesian_prod(tops, lefts).flip(1).repeat(C, 1)
-    return _Tiles(TILE_SIZE, origins, per_tile.cumsum(0) - per_tile, per_tile, flatten_ids)
+    return _Tiles(TILE_SIZE, origins, offsets, per_tile, flatten_ids)
 
 
 class _Composite(torch.autograd.Function):
@@ -210,7 +219,9 @@ class _Composite(torch.autograd.Function):
         v_canvas = grad_outputs[0]  # [T, S * S, D + 1]
         D = colors.shape[-1]
         flat_colors = colors.flatten(0, 1)
-        sizes = [2, 3, 1, D] + [2] * ctx.absgrad
+        sizes = [2, 3, 1, D]
+        if ctx.absgrad:
+            sizes.append(2)
         grads = means2d.new_zeros(opacities.numel(), sum(sizes))  # [C * N, 6 + D (+ 2)]
         for (chunk, length), starts in zip(_chunks(tiles), ctx.starts, strict=True):
             v_colors, v_alphas = v_canvas[chunk].split([D, 1], dim=-1)  # [B, S * S, D], [B, S * S, 1]
@@ -288,27 +299,34 @@ def _segment_gradients(
     dots = v_colors @ colors.mT  # [B, S * S, L]
     shares = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)
     shares = shares.flip(-1).cumsum(dim=-1).flip(-1)  # [B, S * S, L + 1] from each Gaussian backwards
-    v_alphas = (dots.view_as(alphas) * segment.transmittances[..., :-1]).sub_(
-        shares[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
-    )
+    hidden = shares[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
+    v_alphas = (dots.view_as(alphas) * segment.transmittances[..., :-1]).sub_(hidden)
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
     # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
     columns = v_sigmas.sum(dim=1, keepdim=True)  # [B, 1, S, L]
     rows = v_sigmas.sum(dim=2, keepdim=True)  # [B, S, 1, L]
     mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
-    total, mx, my, mxx, mxy, myy = (
-        moment.sum(dim=(1, 2))
-        for moment in (rows, columns * dx, rows * dy, columns * dx * dx, mixed * dy, rows * dy * dy)
-    )  # [B, L]
+    # [B, L]
+    total = rows.sum(dim=(1, 2))
+    mx = (columns * dx).sum(dim=(1, 2))
+    my = (rows * dy).sum(dim=(1, 2))
+    mxx = (columns * dx * dx).sum(dim=(1, 2))
+    mxy = (mixed * dy).sum(dim=(1, 2))
+    myy = (rows * dy * dy).sum(dim=(1, 2))
     a0 = a[:, 0, 0]
     b0 = b[:, 0, 0]
     c0 = c[:, 0, 0]
     # alpha = opacity * exp(-sigma) wherever v_sigma is not zero, and then opacity >= _MIN_ALPHA.
     v_opacity = -total / segment.opacities.clamp_min(_MIN_ALPHA)
-    columns_of = [a0 * mx + b0 * my, b0 * mx + c0 * my, 0.5 * mxx, mxy, 0.5 * myy, v_opacity]
-    parts = [torch.stack(columns_of, dim=-1), weights.flatten(1, 2).mT @ v_colors]
+    v_x = a0 * mx + b0 * my
+    v_y = b0 * mx + c0 * my
+    v_geometry = torch.stack([v_x, v_y, 0.5 * mxx, mxy, 0.5 * myy, v_opacity], dim=-1)  # [B, L, 6]
+    parts = [v_geometry, weights.flatten(1, 2).mT @ v_colors]
     if absgrad:
-        slopes = (a * dx + b * dy, b * dx + c * dy)  # [B, S, S, L]
-        parts.append(torch.stack([slope.mul_(v_sigmas).abs_().sum(dim=(1, 2)) for slope in slopes], dim=-1))
+        # [B, S, S, L]
+        slopes_x = a * dx + b * dy
+        slopes_y = b * dx + c * dy
+        sums = [slopes.mul_(v_sigmas).abs_().sum(dim=(1, 2)) for slopes in (slopes_x, slopes_y)]
+        parts.append(torch.stack(sums, dim=-1))
     return torch.cat(parts, dim=-1).flatten(0, 1), shares[..., :1]

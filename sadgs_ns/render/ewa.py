@@ -42,8 +42,12 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     cy = Ks[:, 1, 2, None]
     margin_x = FRUSTUM_MARGIN * (0.5 * width / fx)
     margin_y = FRUSTUM_MARGIN * (0.5 * height / fy)
-    x = z * torch.clamp(x / z, min=-(cx / fx + margin_x), max=(width - cx) / fx + margin_x)
-    y = z * torch.clamp(y / z, min=-(cy / fy + margin_y), max=(height - cy) / fy + margin_y)
+    left = -(cx / fx + margin_x)
+    right = (width - cx) / fx + margin_x
+    top = -(cy / fy + margin_y)
+    bottom = (height - cy) / fy + margin_y
+    x = z * torch.clamp(x / z, min=left, max=right)
+    y = z * torch.clamp(y / z, min=top, max=bottom)
     zero = torch.zeros_like(z)
     jacobian = torch.stack([fx / z, zero, -fx * x / z2, zero, fy / z, -fy * y / z2], dim=-1)
     jacobian = jacobian.reshape(*z.shape, 2, 3)

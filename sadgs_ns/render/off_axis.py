@@ -22,6 +22,8 @@ def cull_off_axis(radii: Tensor, means2d: Tensor, width: int, height: int, max_o
     x, y = means2d.unbind(dim=-1)
     half_width = width / 2
     half_height = height / 2
-    near = (x - half_width).abs() < max_off_axis * half_width
-    near &= (y - half_height).abs() < max_off_axis * half_height  # [C, N]
-    return radii * (near[..., None] if has_radius_per_axis(radii, means2d) else near)
+    is_near = (x - half_width).abs() < max_off_axis * half_width
+    is_near &= (y - half_height).abs() < max_off_axis * half_height  # [C, N]
+    if has_radius_per_axis(radii, means2d):
+        is_near = is_near[..., None]
+    return radii * is_near

@@ -57,32 +57,42 @@ def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[
     """
     drawn = projected
     if options.expected_depth:
-        drawn = projected._replace(colors=torch.cat([projected.colors, projected.depths[..., None]], dim=-1))
+        depths = projected.depths[..., None]  # [C, N, 1]
+        colors = torch.cat([projected.colors, depths], dim=-1)
+        drawn = projected._replace(colors=colors)
     backend = _backend(options.backend, projected.means2d.device)
     renders, alphas, lists = backend.composite(drawn, options)
     if options.expected_depth:
-        renders = torch.cat([renders[..., :-1], renders[..., -1:] / alphas.clamp_min(1e-10)], dim=-1)
+        colors = renders[..., :-1]
+        expected_depths = renders[..., -1:] / alphas.clamp_min(1e-10)
+        renders = torch.cat([colors, expected_depths], dim=-1)
     return renders, alphas, projected.info() | lists
 
 
 _REMEDY = "set the option model.backend to auto, of a finished run in its config.yml"
 
 
-def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True) -> str:
+def choose_backend(wanted: BackendName, device: torch.device, single_process: bool = True) -> str:
     """Return which backend draws on a device: "triton", "gsplat" or "torch".
 
     "auto" is Triton where its kernels run, gsplat on CUDA without them, and torch elsewhere. They draw the same, but
     that gsplat 1.4 cuts Gaussians off at borders of larger tiles. Only Triton's steps become CUDA graphs, and gsplat
-    cannot draw for several processes. Raise InputError if the backend that is wanted does not draw here.
+    draws only for a `single_process`, which holds all Gaussians. Raise InputError if the backend that is wanted does
+    not draw here.
     """
     chosen: str = wanted
     if wanted == "auto":
-        chosen = "triton" if use_triton(device) else "gsplat" if device.type == "cuda" else "torch"
+        if use_triton(device):
+            chosen = "triton"
+        elif device.type == "cuda":
+            chosen = "gsplat"
+        else:
+            chosen = "torch"
     if wanted == "triton" and not use_triton(device):
         raise InputError(f"The backend triton does not run on {device} here (see sadgs-doctor): {_REMEDY}.")
     if chosen == "gsplat" and device.type != "cuda":
         raise InputError(f"The backend gsplat needs a CUDA device, and this is {device}: {_REMEDY}.")
-    if chosen == "gsplat" and not alone:
+    if chosen == "gsplat" and not single_process:
         problem = "The backend gsplat works on one device only, and this run takes several"
         raise InputError(f"{problem}: take one, or let Triton draw (sadgs-doctor says whether it works).")
     return chosen
@@ -90,7 +100,8 @@ def choose_backend(wanted: BackendName, device: torch.device, alone: bool = True
 
 def _backend(wanted: BackendName, device: torch.device) -> Any:
     """Import the module of a backend. Triton need not be installed, and gsplat's loads nothing before it draws."""
-    return import_module(f"sadgs_ns.render.backend_{choose_backend(wanted, device)}")
+    name = choose_backend(wanted, device)
+    return import_module(f"sadgs_ns.render.backend_{name}")
 
 
 def visible(info: Mapping[str, Any]) -> Tensor:
@@ -106,4 +117,5 @@ def viewmats_from_camera_to_world(
     rotations = (camera_to_worlds[:, :, :3] * flip).mT  # [C, 3, 3], the inverse of an orthonormal matrix
     translations = -rotations @ camera_to_worlds[:, :, 3:]  # [C, 3, 1]
     bottom = camera_to_worlds.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera_to_worlds), 1, 4)
-    return torch.cat([torch.cat([rotations, translations], dim=-1), bottom], dim=-2)
+    top = torch.cat([rotations, translations], dim=-1)  # [C, 3, 4]
+    return torch.cat([top, bottom], dim=-2)

@@ -170,11 +170,10 @@ def _phases(size: StepSize, device: torch.device) -> dict[str, _Phase]:
     loss_pixel = TORCH_LOSS_PIXEL_BYTES
     if use_triton(device):
         loss_pixel = LOSS_PIXEL_BYTES
-    return {
-        "tile lists": _Phase(sorted_by_depth, 0.0, PAIR_SORT_BYTES),
-        "loss": _Phase(projected, loss_pixel * size.pixels, PAIR_BYTES),
-        "backward": _Phase(projected + gradients, PIXEL_BYTES * size.pixels, PAIR_BYTES),
-    }
+    sorting = _Phase(sorted_by_depth, 0.0, PAIR_SORT_BYTES)
+    loss = _Phase(projected, loss_pixel * size.pixels, PAIR_BYTES)
+    backward = _Phase(projected + gradients, PIXEL_BYTES * size.pixels, PAIR_BYTES)
+    return {"tile lists": sorting, "loss": loss, "backward": backward}
 
 
 def _row_bytes(tensor: Tensor) -> int:

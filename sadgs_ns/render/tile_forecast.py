@@ -64,7 +64,7 @@ class TileForecast:
         view was never visited, no view was visited since a densification, or there are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
-            self._epoch = self._epoch + 1
+            self._epoch += 1
             self._num_gaussians = num_gaussians
             self._changes.clear()
         total = 0.0
@@ -76,11 +76,19 @@ class TileForecast:
             if visit.epoch < self._epoch and not changes:
                 return None
             total += max([1.0, *changes]) * visit.num_pairs
-        number = int(MARGIN * total) + 1
-        # This many equal steps lead from a power of two to the next.
-        step = max((1 << number.bit_length() - 1) // (2 if self.round_to_powers else 16), _LEAST_STEP)
-        rounded = -(-number // step) * step
-        return rounded if rounded <= MOST_PAIRS else None
+        rounded = self._round_up(int(MARGIN * total) + 1)
+        if rounded > MOST_PAIRS:
+            return None
+        return rounded
+
+    def _round_up(self, number: int) -> int:
+        """Round a number > 0 up, so that few different ones occur."""
+        steps = 16  # Number of equal steps from a power of two to the next
+        if self.round_to_powers:
+            steps = 2
+        power_of_two = 1 << (number.bit_length() - 1)  # The largest that is not above the number
+        step = max(power_of_two // steps, _LEAST_STEP)
+        return -(-number // step) * step
 
     def rendered(self, views: Sequence[int], size: tuple[int, int], capacity: int | None, counts: Counts) -> None:
         """Note the exact numbers of the call for which `capacity` was asked last; they may arrive later."""
@@ -96,7 +104,8 @@ class TileForecast:
                 before = self._visits.get((view, call.size))
                 self._visits[view, call.size] = _Visit(call.epoch, num_pairs)
                 if before is not None and call.epoch == self._epoch:
-                    self._changes.append((before.epoch, (num_pairs + _SMALL) / (before.num_pairs + _SMALL)))
+                    factor = (num_pairs + _SMALL) / (before.num_pairs + _SMALL)
+                    self._changes.append((before.epoch, factor))
             if call.capacity is not None and sum(counts) > call.capacity:
                 lost += call.views
         return lost

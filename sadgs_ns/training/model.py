@@ -129,7 +129,7 @@ class SadgsModel(SplatfactoModel):
 
     def shard(self, world: World) -> None:
         """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
-        choose_backend(self.config.backend, world.device, world.alone)
+        choose_backend(self.config.backend, world.device, world.is_single)
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data[part].clone()
@@ -139,7 +139,7 @@ class SadgsModel(SplatfactoModel):
     @property
     def num_gaussians(self) -> int:
         """Number of Gaussians of all processes."""
-        if self.world.alone:
+        if self.world.is_single:
             return self.num_points
         return self.world.total
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from PIL import Image
 from rich.console import Console
 
@@ -29,8 +28,10 @@ from sadgs_ns.cli.sadgs import main
 from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
+from sadgs_ns.errors import RunError
 from sadgs_ns.files import locked
 from sadgs_ns.placing.plan import Summary
+from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.stamps import photo_stamps
 
 TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
@@ -184,7 +185,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
 
 @pytest.mark.hard_case(
     "photos added to the folder of a finished `sadgs`, interrupted in each stage",
-    "cameras are added, and another run is trained in the same frame, with the same held-out views; the "
+    "cameras are added, and another run is trained on all photos in the same frame; the "
     "earlier splat and run stay until the new one is written",
 )
 def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was(
@@ -225,9 +226,8 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     assert not first.exists() and splat.read_bytes() != written
     assert (second / "dataparser_transforms.json").read_bytes() == moved, "the splat stays where it was"
     described = json.loads((folder / "scene" / "transforms.json").read_text())
-    held_out = get_train_eval_split_fraction(sorted(set(names) - set(later)), 0.9)[1]
-    assert described["test_filenames"] == [f"images/{sorted(set(names) - set(later))[i]}" for i in held_out]
-    assert len(described["train_filenames"]) == 10 - len(held_out)
+    assert described["train_filenames"] == [f"images/{name}" for name in names], "all photos are trained on"
+    assert described["val_filenames"] == described["test_filenames"] == []
 
     finish_again(command, folder, capsys)
     (source / "03.png").unlink()
@@ -237,8 +237,10 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
 
 
 def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_split(photos: Path, tmp_path: Path):
+    """In a folder that an earlier version began, nine photos in ten are trained on."""
     work = PhotosToSplat(Sadgs(photos, tmp_path / "out"), [], Console(quiet=True))
     work.results.scene.mkdir(parents=True)
+    work.results.settings.measure = None
 
     def choose(number: int) -> dict[str, Any]:
         file = work.results.scene / "transforms.json"
@@ -310,6 +312,43 @@ def test_the_command_that_compares_more_pairs_keeps_the_size(
     monkeypatch.setattr(PhotosToSplat, "call", lambda *others: found)
     assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply", "--max-size", "400"]) == 1
     assert "/scene --max-size 400 --matching exhaustive`, and run" in capsys.readouterr().err
+
+
+@pytest.mark.hard_case(
+    "the cameras that `sadgs` found are wrong", "it ends before training with the reason; `--anyway` goes on"
+)
+def test_wrong_cameras_end_it_until_it_shall_go_on_anyway(
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    summary = Summary(10, 10, 100, 0.5, {}, "exhaustive", faults=["they see too much: zoom in", "they are flat: move"])
+    called: list[str] = []
+
+    def call(work: PhotosToSplat, worker: object, line: object, on_event: Any, command: list[str], *others: Any) -> Any:
+        called.append(command[0])
+        if command[0] != "sadgs-process":
+            raise RunError("stopped here")
+        settings = Scene(work.process).settings
+        settings.files = photo_stamps(photos, settings.photos)
+        (work.results.scene / "work").mkdir(parents=True)
+        settings.write(work.results.scene / "work" / "settings.json")
+        (work.results.scene / "transforms.json").write_text('{"frames": []}')
+        return dataclasses.asdict(summary)
+
+    monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
+    monkeypatch.setattr(PhotosToSplat, "call", call)
+    command = [str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]
+    assert main(command) == 1
+    told = "sadgs: 10 of 10 photos registered, but the cameras are wrong, because they see too much: zoom in; and they "
+    remedies = "are flat: move; begin another --output with such photos; or go on with these with --anyway.\n"
+    assert capsys.readouterr().err == told + remedies
+    assert called == ["sadgs-process"] and (tmp_path / "out" / "scene" / "transforms.json").exists()
+    assert main([*command, "--anyway"]) == 1
+    printed = capsys.readouterr()
+    assert "10 of 10 photos registered; done before" in printed.out and printed.err == "sadgs: stopped here\n"
+    assert called == ["sadgs-process", "ns-train"]
+    assert main([str(photos), "-o", str(tmp_path / "other"), "--formats", "ply", "--anyway"]) == 1
+    assert called[2:] == ["sadgs-process", "ns-train"]
+    assert "warning: the cameras are wrong, because they are flat: move." in capsys.readouterr().out
 
 
 @pytest.mark.hard_case(
@@ -389,7 +428,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
             Path(command[2]).mkdir()
             (Path(command[2]) / "transforms.json").write_text('{"frames": []}')
             return dataclasses.asdict(Summary(10, 10, 100, 0.5, {}, "exhaustive"))
-        on_event("warning", told="masks are not used: end the command with `colmap` to use them.")
+        on_event("warning", sentence="masks are not used: end the command with `colmap` to use them.")
         on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
         (work.results.run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
@@ -463,6 +502,7 @@ def test_settings_that_an_earlier_version_wrote_are_read(
     assert "(--effort was 0.5, is 1.0); give another --output or delete it." in capsys.readouterr().err
     assert main([*command, "--effort", "0.5"]) == 2
     assert "(options of ns-train was --max-num-iterations 8, is none); give" in capsys.readouterr().err
+    assert "test_filenames" not in json.loads((out / "scene" / "transforms.json").read_text()), "its division stays"
 
 
 @pytest.mark.hard_case(

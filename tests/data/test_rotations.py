@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sadgs_ns.data.checks.colmap import _rotations
+from sadgs_ns.data.colmap_views import _rotations
 
 
 def test_quaternions_become_the_matrices_that_scipy_makes_of_them():

@@ -45,7 +45,7 @@ def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
 
 def test_a_world_of_one_process_asks_nobody():
     world, values = World(), torch.tensor([3, 4])
-    assert world.alone and world.rank == 0 and world.take_even_part(5) == slice(0, 5) and world.total == 5
+    assert world.is_single and world.rank == 0 and world.take_even_part(5) == slice(0, 5) and world.total == 5
     assert world.sum(values) is values and world.sums(3, 4) == [3, 4]
     assert world.gather(values).tolist() == [[3, 4]] and values.data_ptr() == world.gather(values).data_ptr()
     world.broadcast(values, 0)

@@ -32,13 +32,16 @@ def walk_centres() -> np.ndarray:
     return 0.8 + ahead * np.array([0.69, 0.66, 0.3]) + sway * np.array([-0.7, 0.7, 0.2])
 
 
-def draw_photos(centres: np.ndarray | None = None) -> Iterator[Image.Image]:
-    """Photos of a corner of a room whose walls carry noise, which has many features and takes milliseconds to draw."""
+def draw_photos(centres: np.ndarray | None = None, focal_length: float = WIDTH) -> Iterator[Image.Image]:
+    """Photos of a corner of a room whose walls carry noise, which has many features and takes milliseconds to draw.
+
+    They are taken from `camera_centres`, or from others [N, 3], with a focal length in px.
+    """
     random, side = np.random.default_rng(0), 256
     noise = [cv2.GaussianBlur(random.integers(0, 256, (side, side, 3), np.uint8), (0, 0), 2) for _ in WALLS]
     textures = [np.clip((texture - 127.0) * 5 + 127, 0, 255).astype(np.uint8) for texture in noise]
     corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.float32)
-    intrinsics = np.array([[WIDTH, 0, WIDTH / 2], [0, WIDTH, HEIGHT / 2], [0, 0, 1]])
+    intrinsics = np.array([[focal_length, 0, WIDTH / 2], [0, focal_length, HEIGHT / 2], [0, 0, 1]])
     for centre in camera_centres() if centres is None else centres:
         forward = 0.8 - centre
         forward /= np.linalg.norm(forward)

@@ -242,6 +242,61 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     assert told == f"A first attempt registered {registered}, one with relaxed limits {VIEWS}."
 
 
+@pytest.mark.hard_case(
+    "all photos register with an angle of view that no lens has",
+    "a second attempt; a model that can be right is kept, even with fewer photos",
+)
+def test_a_wrong_model_ranks_below_one_with_fewer_photos(
+    run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shutil.copy(run.out / "work" / "database.db", tmp_path)
+    attempts: list[int] = []
+
+    def spoil(model: pycolmap.Reconstruction, *fixed: Any) -> None:
+        adjust_robustly(model, *fixed)
+        attempts.append(model.num_reg_images())
+        if len(attempts) == 1:
+            for camera in model.cameras.values():
+                camera.params = [78934, 78934, *camera.params[2:]]
+        else:
+            for frame in list(model.frames)[VIEWS - 3 :]:
+                model.deregister_frame(frame)
+
+    monkeypatch.setattr(reconstruct, "adjust_robustly", spoil)
+    names = sorted(photo.name for photo in photos.iterdir())
+    reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
+    made = pycolmap.Reconstruction(tmp_path / "model")
+    assert attempts == [VIEWS, VIEWS] and made.num_reg_images() == VIEWS - 3
+    assert all(camera.mean_focal_length() < 1000 for camera in made.cameras.values())
+
+
+@pytest.mark.hard_case("photos of which COLMAP makes cameras without points", "refused, as where none are related")
+def test_cameras_without_points_are_none(run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shutil.copy(run.out / "work" / "database.db", tmp_path)
+    model = pycolmap.Reconstruction(run.out / "work" / "model")
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *others, **callbacks: {0: model})
+    names = sorted(photo.name for photo in photos.iterdir())
+    with pytest.raises(
+        InputError, match=r"could be related to each other .*; take more of them, from different places"
+    ):
+        reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
+    assert not (tmp_path / "model").exists()
+
+
+def test_the_summary_has_the_reasons_that_speak_against_a_model(run: Run, photos: Path):
+    assert run.summary.doubts == run.summary.faults == [] and not run.summary.is_poor
+    model = pycolmap.Reconstruction(run.out / "work" / "model")
+    for camera in model.cameras.values():
+        camera.params = [33, 45, *camera.params[2:]]
+    names = sorted(photo.name for photo in photos.iterdir())
+    summary = reconstruct.summarize(names, model, run.out / "work" / "database.db", "exhaustive", "")
+    assert summary.is_poor and summary.registered == VIEWS
+    assert summary.faults[0].startswith("they would see 135° across, more than a lens does: ")
+    assert summary.doubts[0].startswith("their focal lengths across and down would differ by a factor of 1.4: ")
+
+
 # nerfstudio opens the first photo to learn its size and does not close it.
 OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
 
@@ -662,6 +717,40 @@ def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp
     assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
 
 
+def test_a_mistake_of_ours_is_not_taken_for_a_damaged_photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    next(draw_photos()).save(tmp_path / "a.jpg")
+    next(draw_photos()).resize((120, 90)).save(tmp_path / "a.png")
+    assert look_into(tmp_path, tmp_path / "out")[0] == ["a.jpg"]
+
+    def mistaken(*others: Any, **named: Any) -> None:
+        raise KeyError("a mistake")
+
+    with monkeypatch.context() as patched, pytest.raises(KeyError, match="a mistake"):
+        patched.setattr(np, "corrcoef", mistaken)
+        look_into(tmp_path, tmp_path / "out")
+    (tmp_path / "masks").mkdir()
+    Image.radial_gradient("L").save(tmp_path / "masks" / "a.png")
+    with monkeypatch.context() as patched, pytest.raises(KeyError, match="a mistake"):
+        patched.setattr(np, "unique", mistaken)
+        look_into(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.hard_case(
+    "a photo and another one of its name, one cut off or of bytes alone", "no copies; it is named when photos are read"
+)
+@pytest.mark.parametrize("size", [0.5, 0.05, 0])
+def test_damaged_photos_are_copies_of_none(tmp_path: Path, size: float):
+    view = next(draw_photos())
+    view.save(tmp_path / "a.jpg")
+    view.resize((120, 90)).save(tmp_path / "a.png")
+    view.resize((100, 75)).save(tmp_path / "a_mask.png")
+    for name in ("a.png", "a_mask.png"):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[: int(size * len(content))] + name.encode())
+    found, masks, _ = look_into(tmp_path, tmp_path / "out")
+    assert found == ["a.jpg", "a.png", "a_mask.png"] and masks == {}
+
+
 @pytest.mark.hard_case("a phone's panorama of a part of the view among the photos", "left out, with a line")
 def test_panoramas_of_a_part_of_the_view_are_left_out(tmp_path: Path):
     exif, view = Image.Exif(), next(draw_photos())
@@ -929,14 +1018,14 @@ def test_a_full_disk_is_told_in_a_sentence_that_names_the_folder(photos: Path, t
 
 
 @pytest.fixture
-def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
-    """Has COLMAP register so many of 12 photos at once, instead of running it."""
+def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Has COLMAP register so many of 12 photos at once, instead of running it; fields of the summary may follow."""
 
-    def register(count: int) -> None:
+    def register(count: int, **fields: Any) -> None:
         def stand_in(colmap: Worker, *arguments: Any, folder: Path, report: object) -> dict[str, Any]:
             (folder / "model").mkdir()
             (folder / "database.db").write_bytes(b"features")
-            return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2]))
+            return dataclasses.asdict(Summary(12, count, 100, 0.5, {}, arguments[2], **fields))
 
         monkeypatch.setattr("sadgs_ns.placing.place.make_model", stand_in)
         monkeypatch.setattr(place, "publish", lambda *others: None)
@@ -962,6 +1051,26 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: C
     registered(6)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 0
     assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
+
+
+def test_wrong_cameras_are_warned_of_and_their_scene_is_not_finished(
+    tmp_path: Path, registered: Callable[..., None], capsys: pytest.CaptureFixture[str]
+):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    command = [str(photos), str(tmp_path / "out"), "--matching", "sequential"]
+    registered(12, faults=["they see too much: zoom in", "they are flat: move"], doubts=["there are few: take more"])
+    assert main(command) == 1
+    printed = capsys.readouterr()
+    assert "12 of 12 photos registered" in printed.out and "sadgs-doctor" not in printed.out
+    assert "warning: the cameras may be wrong, because there are few: take more.\n" in printed.out
+    told = "out are wrong, because they see too much: zoom in; and they are flat: move. Try the same command with "
+    assert printed.err.startswith("warning: the cameras in ") and told in printed.err
+    assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
+    assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    registered(12, doubts=["there are few: take more"])
+    assert main(command) == 0
+    printed = capsys.readouterr()
+    assert "may be wrong, because there are few: take more." in printed.out and "sadgs-doctor" in printed.out
 
 
 def test_the_library_tells_its_caller_and_prints_nothing(

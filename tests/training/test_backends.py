@@ -119,7 +119,7 @@ def test_where_it_cannot_draw_it_is_refused(config: SadgsTrainerConfig, monkeypa
     with pytest.raises(InputError, match=r"^The backend gsplat needs a CUDA device, and this is cpu: set .+\.yml\.$"):
         set_up(config)
     with pytest.raises(InputError, match=r"^The backend gsplat works on one device only, and this run takes several: "):
-        rasterization.choose_backend("gsplat", torch.device("cuda"), alone=False)
+        rasterization.choose_backend("gsplat", torch.device("cuda"), single_process=False)
     config.pipeline.model.backend = "auto"
     model, world = set_up(config).pipeline.model, World()
     asked: list[Any] = []

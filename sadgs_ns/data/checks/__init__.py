@@ -17,7 +17,8 @@ from sadgs_ns.data.layouts import ParserOptions, automatic_options, layout_of
 @collect_findings
 def check_data(data: Path) -> Iterator[Finding]:
     """Return findings on a folder, or on a `transforms.json`, as `ns-train` reads it where no parser is named."""
-    if (layout := layout_of(data)) == "colmap":
+    layout = layout_of(data)
+    if layout == "colmap":
         yield from check_colmap(data, automatic_options(data))
     elif layout == "blender":
         yield from check_blender(data, ParserOptions())

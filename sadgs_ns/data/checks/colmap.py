@@ -10,21 +10,17 @@ import sys
 from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sadgs_ns.data import colmap, images, layouts
 from sadgs_ns.data.checks.findings import Finding, collect_findings, fault, warning
 from sadgs_ns.data.checks.geometry import check_points, check_views
 from sadgs_ns.data.checks.images import check_images
 from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
+from sadgs_ns.data.colmap_views import read_views
 from sadgs_ns.data.layouts import ParserOptions, automatic_options
 from sadgs_ns.data.text import read_text
-from sadgs_ns.data.views import Camera, View, check_positive
+from sadgs_ns.data.views import View
 from sadgs_ns.errors import InputError
-
-UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's camera models that nerfstudio cannot read
 
 
 @collect_findings
@@ -32,15 +28,12 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     """Check a COLMAP reconstruction in a folder, to which the options' paths are relative, and its images if asked."""
     folder = data / options.images_path
     model_folder = data / options.colmap_path
-    if (kind := colmap.model_kind(model_folder)) is None:
-        if not (models := layouts.find_reconstructions(data)):
-            raise InputError(no_layout(data))
-        found = automatic_options(data)
-        problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
-        raise InputError(f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`.")
+    kind = colmap.model_kind(model_folder)
+    if kind is None:
+        raise InputError(_no_model(data, model_folder))
     cameras_path = model_folder / f"cameras.{kind}"
     poses_path = model_folder / f"images.{kind}"
-    names, views = _read_views(poses_path, cameras_path)
+    names, views = read_views(poses_path, cameras_path)
     this_model = f"end the command with `colmap {_words(data, options, names)}"
     yield from _check_folders(data, options, names, poses_path)
     files = {split: data / f"{split}_list.txt" for split in SPLITS}
@@ -52,21 +45,46 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
         yield warning(f"{problem}: {this_model} --masks-path masks` to leave out what is black in them.")
     if open_images:
         factor = yield from _check_factor(folder, names, options)
-        masks = None if options.masks_path is None else data / options.masks_path
-        frames = []
-        for name, camera in zip(names, (view.camera for view in views), strict=True):
-            size = images.scaled_size((camera.width, camera.height), factor, options.downscale_rounding_mode)
-            mask = None if masks is None else images.smaller_folder(masks, factor) / images.mask_name(masks, name)
-            frames.append(images.Frame(images.smaller_folder(folder, factor) / name, size, mask))
+        frames = _frames(data, options, names, views, factor)
         yield from check_images(frames, poses_path, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
-        if (points := colmap.points_file(model_folder)) is None:
+        points = colmap.points_file(model_folder)
+        if points is None:
             yield fault(f"{model_folder} has no points3D file: copy the whole reconstruction, or {random}.")
-        else:
-            remedy = f"run COLMAP's mapper again, or {random}"
-            yield from check_points(colmap.read_points(points), views if sound else [], points, remedy)
+            return
+        remedy = f"run COLMAP's mapper again, or {random}"
+        if not sound:
+            views = []
+        yield from check_points(colmap.read_points(points), views, points, remedy)
+
+
+def _no_model(data: Path, model_folder: Path) -> str:
+    """Return the sentence for a folder without a reconstruction where the options look for one."""
+    models = layouts.find_reconstructions(data)
+    if not models:
+        return no_layout(data)
+    found = automatic_options(data)
+    problem = f"{model_folder} holds no COLMAP reconstruction, but {data / found.colmap_path} does"
+    return f"{problem}: add `{_words(data, found, models[found.colmap_path])}` after `colmap`."
+
+
+def _frames(
+    data: Path, options: ParserOptions, names: Sequence[str], views: Sequence[View], factor: int
+) -> list[images.Frame]:
+    """Return the images, scaled down by a factor, of the views with these names, and their masks."""
+    folder = images.smaller_folder(data / options.images_path, factor)
+    frames = []
+    for name, view in zip(names, views, strict=True):
+        size = (view.camera.width, view.camera.height)
+        size = images.scaled_size(size, factor, options.downscale_rounding_mode)
+        mask = None
+        if options.masks_path is not None:
+            masks = data / options.masks_path
+            mask = images.smaller_folder(masks, factor) / images.mask_name(masks, name)
+        frames.append(images.Frame(folder / name, size, mask))
+    return frames
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
@@ -74,7 +92,8 @@ def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], pos
     folder = data / options.images_path
     smaller = images.smaller_folder(folder, options.downscale_factor or 1)
     if not any(os.path.isfile(place / name) for place in (folder, smaller) for name in names):
-        if found := layouts.images_folder(data, options.colmap_path, names):
+        found = layouts.images_folder(data, options.colmap_path, names)
+        if found is not None:
             problem = f"{poses}: image {names[0]} is not in {folder}, but in {data / found}"
             remedy = _words(data, dataclasses.replace(options, images_path=found), names)
             raise InputError(f"{problem}: add `{remedy}` after `colmap`.")
@@ -96,36 +115,11 @@ def _words(data: Path, options: ParserOptions, names: Sequence[str]) -> str:
     words = ["--colmap-path", str(options.colmap_path)]
     if options.images_path != ParserOptions.images_path:
         words += ["--images-path", str(options.images_path)]
-    if options.downscale_factor not in (None, images.automatic_factor(data / options.images_path / [*names, ""][0])):
+    first = next(iter(names), "")
+    automatic = images.automatic_factor(data / options.images_path / first)
+    if options.downscale_factor not in (None, automatic):
         words += ["--downscale-factor", str(options.downscale_factor)]
     return shlex.join(words)
-
-
-def _read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[View]]:
-    """Return the images' names and views; raise InputError if there is none, or one makes no sense to nerfstudio."""
-    stored = colmap.read_cameras(cameras_path)
-    poses = colmap.read_poses(poses_path)
-    if not poses:
-        raise InputError(f"{poses_path} holds no pose, so there is no image to train on: run COLMAP's mapper again.")
-    for name, camera_id, pose in poses:
-        where = f"{poses_path}: image {name}"
-        if not np.isfinite(pose).all():
-            raise InputError(f"{where} has NaN or infinity in its pose: run COLMAP's mapper again.")
-        if not 0.99 < np.linalg.norm(pose[:4]) < 1.01:
-            raise InputError(f"{where} has a rotation that is no unit quaternion: run COLMAP's mapper again.")
-        if camera_id not in stored:
-            raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
-    called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
-    cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
-    if len({cameras[camera_id].fisheye for _, camera_id, _ in poses}) > 1:
-        problem = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
-        raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
-    rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
-    views = [
-        View(f"{poses_path}: image {name}", called[number], rotation, -rotation.T @ pose[4:], cameras[number])
-        for (name, number, pose), rotation in zip(poses, rotations, strict=True)
-    ]
-    return [name for name, _, _ in poses], views
 
 
 def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) -> Generator[Finding, None, int]:
@@ -145,31 +139,3 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
         raise InputError(f"{problem}: {remedy}.")
     yield warning(f"{problem}: nerfstudio will ask whether to make it with ffmpeg; say yes, or {remedy}.")
     return 1
-
-
-def _camera(camera: colmap.Camera, where: str) -> Camera:
-    """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
-    model = camera.model
-    params = camera.params
-    number = colmap.CAMERA_PARAMETERS.get(camera.model)
-    if number is None or model in UNSUPPORTED_CAMERAS:
-        problem = f"{where} has the model {model}, which nerfstudio cannot read"
-        raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
-    focals = 1 if model.startswith("SIMPLE") or "RADIAL" in model else 2
-    values = {"width": camera.width, "height": camera.height}
-    values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}
-    check_positive(values, where, list(values))
-    if not np.isfinite(params).all() or len(params) != number:
-        raise InputError(f"{where} has {params} instead of {number} finite parameters: run COLMAP's mapper again.")
-    fx = params[0]
-    fy = params[focals - 1]
-    (cx, cy, *rest) = params[focals:]
-    radial, tangential = (rest[:2], rest[2:]) if model == "OPENCV" else (rest, ())
-    return Camera(camera.width, camera.height, fx, fy, cx, cy, tuple(radial), tuple(tangential), "FISHEYE" in model)
-
-
-def _rotations(quats: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return wxyz quaternions [V, 4] as matrices [V, 3, 3]; scipy would take half a second to import."""
-    quats = quats[:, None] / np.linalg.norm(quats, axis=1)[:, None, None]  # [V, 1, 4]
-    cross = np.cross(np.eye(3), quats[..., 1:])  # The matrix of the cross product with the axis. [V, 3, 3]
-    return np.eye(3) + 2 * (quats[..., :1] * cross + cross @ cross)  # Rodrigues' formula

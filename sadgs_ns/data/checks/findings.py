@@ -22,11 +22,33 @@ class Finding:
     sentence: str  # A sentence that names the file and the remedy
 
     def __post_init__(self) -> None:  # A damaged file's names can hold a line's end.
-        object.__setattr__(self, "sentence", "".join(c if c.isprintable() else ascii(c)[1:-1] for c in self.sentence))
+        object.__setattr__(self, "sentence", _printable(self.sentence))
 
 
-fault, warning, note = (functools.partial(Finding, severity) for severity in ("error", "warning", "note"))
-"""Make a finding of each severity of its sentence."""
+def _printable(text: str) -> str:
+    """Return a text in which what cannot be printed is written as Python's ascii() does."""
+    characters = []
+    for character in text:
+        if character.isprintable():
+            characters.append(character)
+        else:
+            characters.append(ascii(character)[1:-1])
+    return "".join(characters)
+
+
+def fault(sentence: str) -> Finding:
+    """Return the finding of an error."""
+    return Finding("error", sentence)
+
+
+def warning(sentence: str) -> Finding:
+    """Return the finding of a warning."""
+    return Finding("warning", sentence)
+
+
+def note(sentence: str) -> Finding:
+    """Return the finding of a remark."""
+    return Finding("note", sentence)
 
 
 def collect_findings(check: Callable[..., Iterator[Finding]]) -> Callable[..., list[Finding]]:
@@ -47,11 +69,15 @@ def collect_findings(check: Callable[..., Iterator[Finding]]) -> Callable[..., l
 
 def and_more(where: object, count: int) -> str:
     """Return the start of a sentence on several files or views: the first of them, and how many others there are."""
-    return f"{where} (and {count - 1} more)" if count > 1 else f"{where}"
+    if count > 1:
+        return f"{where} (and {count - 1} more)"
+    return str(where)
 
 
 def check_findings(findings: Sequence[Finding], data: Path) -> None:
     """Raise InputError with the first error among findings, if there is one, and how many more there are."""
-    if errors := [finding.sentence for finding in findings if finding.severity == "error"]:
-        more = f" (`sadgs-doctor {data}` shows {len(errors) - 1} more.)" if len(errors) > 1 else ""
-        raise InputError(errors[0] + more)
+    errors = [finding.sentence for finding in findings if finding.severity == "error"]
+    if len(errors) > 1:
+        raise InputError(f"{errors[0]} (`sadgs-doctor {data}` shows {len(errors) - 1} more.)")
+    if errors:
+        raise InputError(errors[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,8 +18,9 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
 
 _FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, which then have 1,000 float32 steps
-_WIDEST, _NARROW, _NARROWEST = 170.0, 0.5, 0.01
-"""Angles of view in degrees: lenses without fisheye stay below the first; under the last no pixel shows any depth."""
+_WIDEST = 170.0  # Angle of view in degrees under which lenses without fisheye stay
+_NARROW = 0.5  # Angle in degrees above which lenses stay
+_NARROWEST = 0.01  # Angle in degrees under which no pixel shows any depth
 _FARTHEST_CENTER = 10  # Distance in image sizes at which a principal point is a mistake, and not due to a crop
 _STRONGEST_DISTORTION = 2.0  # Quotient of distorted and undistorted radius from which OpenCV's undistortion diverges
 _LEAST_FIT = 0.15  # Correlation of points' and photos' colours: 0.36 to 0.78 in eight captures, else mostly under 0.1
@@ -35,11 +35,15 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
     elif training == 0:
         findings.append(fault(f"{source} leaves no view for training: hold out fewer images."))
     elif training < 3:
-        few = f"{training} training view{'s' * (training > 1)}"
+        few = "1 training view"
+        if training > 1:
+            few = f"{training} training views"
         findings.append(warning(f"{source} leaves {few}: so few fix no shape; take 20 or more."))
-    findings += [*check_rotations(views), *_check_centres(views, source)]
-    first = {view.camera: view.where_camera for view in reversed(views)}  # Of views with one camera the first is named.
-    findings += [finding for camera, where in first.items() for finding in _check_camera(camera, where)]
+    findings += check_rotations(views)
+    findings += _check_centres(views, source)
+    first = {view.camera: view.where_camera for view in reversed(views)}  # The first view with a camera names it.
+    for camera, where in first.items():
+        findings += _check_camera(camera, where)
     yield from findings
     return all(finding.severity != "error" for finding in findings)
 
@@ -47,48 +51,80 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
     """Check that the views' rotations are neither skewed nor mirrored."""
     rotations = np.stack([view.rotation for view in views])  # [V, 3, 3]
-    skewed = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > 0.01
+    products = rotations @ rotations.transpose(0, 2, 1)  # [V, 3, 3]
+    skewed = np.abs(products - np.eye(3)).max(axis=(1, 2)) > 0.01  # [V]
     mirrored = ~skewed & (np.linalg.det(rotations) < 0)
-    for is_wrong, what, remedy in (
-        (skewed, "a pose whose rotation is stretched, skewed or 0", "remove what scales its three columns"),
-        (mirrored, "a mirrored pose (determinant −1)", "negate one column of its rotation"),
-    ):
-        if wrong := list(itertools.compress(views, is_wrong)):
-            where = and_more(wrong[0].where, len(wrong))
-            yield fault(f"{where} has {what}: {remedy}, or compute the poses again.")
+    if skewed.any():
+        where = _first_of(views, skewed)
+        problem = f"{where} has a pose whose rotation is stretched, skewed or 0"
+        yield fault(f"{problem}: remove what scales its three columns, or compute the poses again.")
+    if mirrored.any():
+        where = _first_of(views, mirrored)
+        problem = f"{where} has a mirrored pose (determinant −1)"
+        yield fault(f"{problem}: negate one column of its rotation, or compute the poses again.")
+
+
+def _first_of(views: Sequence[View], marked: NDArray[np.bool_]) -> str:
+    """Return the start of a sentence on the marked views [V], at least one."""
+    first = views[int(marked.argmax())]
+    return and_more(first.where, int(marked.sum()))
 
 
 def _check_centres(views: Sequence[View], source: Path) -> Iterator[Finding]:
     centres = np.stack([view.centre for view in views])  # [V, 3]
-    if len(centres) > 1 and np.abs(centres - centres.mean(axis=0)).max() <= 1e-9 * max(np.abs(centres).max(), 1.0):
+    largest_offset = np.abs(centres - centres.mean(axis=0)).max()
+    rounding = 1e-9 * max(np.abs(centres).max(), 1.0)
+    if len(centres) > 1 and largest_offset <= rounding:
         yield fault(f"{source} has all {len(centres)} cameras in one place, which shows no depth: move between images.")
         return
     _, distances, spread = _spread(centres)
-    far = far_outliers(centres, CAMERA_SHARE)
+    far = far_outliers(centres, CAMERA_SHARE)  # [V]
     if spread > 0 and far.any():
-        where = and_more(views[int(far.argmax())].where, int(far.sum()))
+        where = _first_of(views, far)
         times = f"{distances.max() / spread:.3g} times as far from the other cameras as those are from each other"
-        told = f"{where} has its camera {times}: remove the image from the poses, or compute them again."
-        yield (fault if distances.max() > _FARTHEST * spread else warning)(told)
+        finding = warning
+        if distances.max() > _FARTHEST * spread:
+            finding = fault
+        yield finding(f"{where} has its camera {times}: remove the image from the poses, or compute them again.")
 
 
 def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
-    width = camera.width
-    height = camera.height
-    off = max(abs(camera.cx / width - 0.5), abs(camera.cy / height - 0.5))  # In image sizes from the middle.
-    if off > 0.5 or max(camera.cx, camera.cy) <= 1:  # The latter are shares of the image, or were not known.
-        place = f"{'outside' if off > 0.5 else 'in a corner of'} its image of {width} × {height} px"
-        center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px, {place}"
-        yield (fault if off > _FARTHEST_CENTER else warning)(f"{where} has {center}: correct cx and cy, in pixels.")
-    half_width = width / 2 / camera.fx
-    half_height = height / 2 / camera.fy
-    angle = 2 * math.degrees(math.atan(max(half_width, half_height)))
+    yield from _check_principal_point(camera, where)
+    yield from _check_focal_lengths(camera, where)
+    yield from _check_distortion(camera, where)
+
+
+def _check_principal_point(camera: Camera, where: str) -> Iterator[Finding]:
+    off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))  # Image sizes from the middle
+    if off > 0.5:
+        place = "outside"
+    elif max(camera.cx, camera.cy) <= 1:  # These are shares of the image, or were not known.
+        place = "in a corner of"
+    else:
+        return
+    center = f"its principal point at ({camera.cx:g}, {camera.cy:g}) px"
+    image = f"its image of {camera.width} × {camera.height} px"
+    finding = warning
+    if off > _FARTHEST_CENTER:
+        finding = fault
+    yield finding(f"{where} has {center}, {place} {image}: correct cx and cy, in pixels.")
+
+
+def _check_focal_lengths(camera: Camera, where: str) -> Iterator[Finding]:
+    angle = 2 * math.degrees(math.atan(max(_half_sizes(camera))))
     if not camera.fisheye and not _NARROW <= angle <= _WIDEST:
-        focal = f"the focal length {camera.fx:g} px, with which {width} × {height} px span an angle of {angle:.2g}°"
-        yield (warning if _NARROWEST <= angle <= _WIDEST else fault)(f"{where} has {focal}: correct it, in pixels.")
+        size = f"{camera.width} × {camera.height} px"
+        focal = f"the focal length {camera.fx:g} px, with which {size} span an angle of {angle:.2g}°"
+        finding = fault
+        if _NARROWEST <= angle <= _WIDEST:
+            finding = warning
+        yield finding(f"{where} has {focal}: correct it, in pixels.")
     if not 0.5 <= camera.fx / camera.fy <= 2:
         focals = f"the focal lengths {camera.fx:g} and {camera.fy:g} px, which differ as no lens's do"
         yield warning(f"{where} has {focals}: correct them, in pixels.")
+
+
+def _check_distortion(camera: Camera, where: str) -> Iterator[Finding]:
     if any(abs(value) > 0.5 for value in camera.tangential):
         coefficients = ", ".join(f"{value:g}" for value in camera.tangential)
         yield fault(f"{where} has p1, p2 = {coefficients}, which no lens has: calibrate the camera again.")
@@ -98,24 +134,35 @@ def _check_camera(camera: Camera, where: str) -> Iterator[Finding]:
         return
     coefficients = ", ".join(f"{value:g}" for value in camera.radial)
     problem = f"{where} has the radial distortion {coefficients}, which cannot be undone"
+    half_width, half_height = _half_sizes(camera)
     if not _can_be_undone(camera, min(half_width, half_height)):
         yield fault(f"{problem}: calibrate the camera again, or undistort the images yourself.")
     elif not camera.fisheye and not _can_be_undone(camera, math.hypot(half_width, half_height)):
         yield warning(f"{problem} in the image's corners: they will be wrong; calibrate the camera again.")
 
 
+def _half_sizes(camera: Camera) -> tuple[float, float]:
+    """Return half an image's width and height, in focal lengths."""
+    return camera.width / 2 / camera.fx, camera.height / 2 / camera.fy
+
+
 def _can_be_undone(camera: Camera, radius: float) -> bool:
     """Return whether each pixel up to a distorted radius, in focal lengths from the middle, shows one place alone."""
-    # Without distortion these are radii, or angles of a fisheye.
-    undistorted = np.linspace(0, np.pi if camera.fisheye else 4 * radius, 2049)
+    largest = 4 * radius
+    if camera.fisheye:
+        largest = np.pi
+    undistorted = np.linspace(0, largest, 2049)  # Radii, or angles of a fisheye
     with np.errstate(all="ignore"):  # Large coefficients overflow.
         factor = np.polyval([*reversed(camera.radial), 1.0], undistorted**2)
         distorted = undistorted * factor
         falls = ~(np.diff(distorted) > 0)
-    end = int(falls.argmax()) if falls.any() else len(falls)  # Up to here it rises.
+    end = len(falls)  # Up to here the distorted radius rises.
+    if falls.any():
+        end = int(falls.argmax())
     if not distorted[end] >= radius:
         return False
-    strength = factor[: end + 1][distorted[: end + 1] >= radius][0]
+    is_reached = distorted[: end + 1] >= radius
+    strength = factor[int(is_reached.argmax())]  # Where the distorted radius reaches the given one
     return bool(camera.fisheye or strength <= _STRONGEST_DISTORTION)
 
 
@@ -128,7 +175,8 @@ def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Findin
         yield fault(f"{path} should hold the SfM points but {problem}: {remedy}.")
         return
     yield from check_points(points, views, path, remedy)
-    if len(points[1]) and (points[1] == ply.GREY).all():
+    _, colors = points
+    if len(colors) and (colors == ply.GREY).all():
         yield note(f"{path} has points without colours, which start grey.")
 
 
@@ -147,16 +195,17 @@ def check_points(points: colmap.Points, views: Sequence[View], path: Path, remed
 
 
 def _check_colors(points: colmap.Points, views: Sequence[View], path: Path, remedy: str) -> Iterator[Finding]:
-    every = slice(None, None, len(points[0]) // 10_000 + 1)
-    positions = points[0][every]
-    colors = points[1][every]
+    step = len(points[0]) // 10_000 + 1
+    positions = points[0][::step]
+    colors = points[1][::step]
+    some_views = views[:: len(views) // 8 + 1]
     with ThreadPoolExecutor() as pool:  # Pillow decodes in threads.
-        found = pool.map(lambda view: _fit(positions, colors, view), views[:: len(views) // 8 + 1])
+        found = pool.map(lambda view: _fit(positions, colors, view), some_views)
         fits = [fit for fit in found if fit is not None]
     if len(fits) > 2 and np.median(fits) < _LEAST_FIT:
-        told = f"{path} has points whose colours are not those of the photos where the poses put them"
-        why = "as where points and poses differ in axes or units, or photos are exchanged"
-        yield warning(f"{told}, {why}: check both, {remedy}.")
+        problem = f"{path} has points whose colours are not those of the photos where the poses put them"
+        cause = "as where points and poses differ in axes or units, or photos are exchanged"
+        yield warning(f"{problem}, {cause}: check both, {remedy}.")
 
 
 def _fit(positions: NDArray[np.float64], colors: NDArray[np.uint8], view: View) -> float | None:
@@ -166,40 +215,57 @@ def _fit(positions: NDArray[np.float64], colors: NDArray[np.uint8], view: View) 
     compared, as the sky is up in a wrong photo, too.
     """
     camera = view.camera
+    if camera.fisheye or view.image is None:
+        return None
     x, y, z = view.rotation @ (positions - view.centre).T  # [P] each
     with np.errstate(all="ignore"):
         bend = np.polyval([*reversed(camera.radial), 1.0], (x**2 + y**2) / z**2)
-        place = np.stack([x * camera.fx, y * camera.fy], -1) * (bend / z)[:, None] + [camera.cx, camera.cy]
-    place /= [camera.width, camera.height]  # [P, 2]
-    seen = (z > 0) & (bend > 2 / 3) & (place >= 0).all(1) & (place < 1).all(1)  # With less, lenses fold back.
-    if camera.fisheye or seen.sum() < 200 or view.image is None or (shown := read_small(view.image)) is None:
+        pixels = np.stack([x * camera.fx, y * camera.fy], -1) * (bend / z)[:, None] + [camera.cx, camera.cy]
+    places = pixels / [camera.width, camera.height]  # Shares of width and height. [P, 2]
+    is_inside = (places >= 0).all(1) & (places < 1).all(1)
+    seen = (z > 0) & (bend > 2 / 3) & is_inside  # With less, lenses fold back.
+    if seen.sum() < 200:
+        return None
+    image = read_small(view.image)
+    if image is None:
         return None
     seen[seen] = z[seen] <= np.median(z[seen])
-    column, row = (place[seen] * shown.shape[1::-1]).astype(int).T
-    cell = (place[seen] * 4).astype(int) @ [1, 4]
-    both = np.concatenate([colors[seen], shown[row, column]], axis=1).astype(np.float64)  # [S, 6]
-    for number in np.unique(cell):
-        both[cell == number] -= both[cell == number].mean(axis=0)
-    spreads = both[:, :3].std(), both[:, 3:].std()
-    return float((both[:, :3] * both[:, 3:]).mean() / math.prod(spreads)) if min(spreads) > _LEAST_SPREAD else None
+    places = places[seen]  # [S, 2]
+    columns, rows = (places * image.shape[1::-1]).astype(int).T
+    cells = (places * 4).astype(int) @ [1, 4]  # [S]
+    both = np.concatenate([colors[seen], image[rows, columns]], axis=1).astype(np.float64)  # [S, 6]
+    for cell in np.unique(cells):
+        both[cells == cell] -= both[cells == cell].mean(axis=0)
+    of_points = both[:, :3]
+    of_image = both[:, 3:]
+    spread_of_points = of_points.std()
+    spread_of_image = of_image.std()
+    if not min(spread_of_points, spread_of_image) > _LEAST_SPREAD:
+        return None
+    return float((of_points * of_image).mean() / (spread_of_points * spread_of_image))
 
 
 def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path: Path) -> Iterator[Finding]:
-    if (far := far_outliers(positions, POINT_SHARE)).any():
-        told = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
-        yield note(f"{path} has {told}: training leaves them out.")
+    far = far_outliers(positions, POINT_SHARE)
+    if far.any():
+        outliers = f"{far.sum()} of {len(far)} points more than {REACH:g} times as far out as {POINT_SHARE:.0%} of them"
+        yield note(f"{path} has {outliers}: training leaves them out.")
     positions = positions[~far]
     middle, _, spread = _spread(np.stack([view.centre for view in views]))
     distance = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     remedy = "take points and poses of one reconstruction, in the same units and axes"
     if spread > 0 and distance > 1e3 * spread:
-        told = f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart"
-        kind = fault if distance > 1e5 * spread else warning
-        yield kind(f"{told}, so that all images see them from one direction: {remedy}.")
+        problem = f"{path} has its points {distance / spread:.3g} times as far away as the cameras are apart"
+        finding = warning
+        if distance > 1e5 * spread:
+            finding = fault
+        yield finding(f"{problem}, so that all images see them from one direction: {remedy}.")
         return
-    if (seeing := _share_of_views_with_points(positions, views)) < 0.5:
-        whom = f"only {seeing:.0%} of the cameras" if seeing else "no camera"
-        yield (warning if seeing else fault)(f"{path} has points that {whom} can see in front of it: {remedy}.")
+    share = _share_of_views_with_points(positions, views)
+    if share == 0:
+        yield fault(f"{path} has points that no camera can see in front of it: {remedy}.")
+    elif share < 0.5:
+        yield warning(f"{path} has points that only {share:.0%} of the cameras can see in front of it: {remedy}.")
 
 
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
@@ -223,4 +289,6 @@ def _spread(centres: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     middle = np.median(centres, axis=0)
     distances = np.linalg.norm(centres - middle, axis=1)
     spread = float(np.quantile(distances, CAMERA_SHARE, method="lower"))
-    return middle, distances, spread if spread > 1e-9 * np.abs(middle).max() else 0.0  # A tripod's is rounding.
+    if not spread > 1e-9 * np.abs(middle).max():  # A tripod's is rounding.
+        spread = 0.0
+    return middle, distances, spread

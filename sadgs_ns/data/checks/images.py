@@ -30,35 +30,55 @@ def check_images(frames: Sequence[images.Frame], source: Path, look_for_unused: 
     for same in problems.values():
         path, text = same[0]
         yield fault(f"{and_more(path, len(same))} {text}.")
-    if twice := [image for image, poses in Counter(frame.image for frame in frames).items() if poses > 1]:
-        told = f"{source} has more than one pose of {and_more(twice[0], len(twice))}"
-        yield fault(f"{told}: keep one, or give each an image of its own.")
-    if look_for_unused and (unused := _unused_images(frames)):
-        where = and_more(unused[0], len(unused))
-        yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
+    poses = Counter(frame.image for frame in frames)
+    repeated = [image for image, number in poses.items() if number > 1]
+    if repeated:
+        where = and_more(repeated[0], len(repeated))
+        yield fault(f"{source} has more than one pose of {where}: keep one, or give each an image of its own.")
+    if look_for_unused:
+        yield from _check_unused(frames, source)
     if problems:
         return
     if all(images.is_flat(frame.image) for frame in frames):
-        told = f"{source} has {len(frames)} images that show a single colour and nothing else"
-        yield fault(f"{told}, such as {frames[0].image}: export them again.")
+        problem = f"{source} has {len(frames)} images that show a single colour and nothing else"
+        yield fault(f"{problem}, such as {frames[0].image}: export them again.")
     if all(frame.mask is not None and images.is_flat(frame.mask, black=True) for frame in frames):
-        told = f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}"
-        yield fault(f"{told}, which leaves no pixel to train on: make white what is to be trained on.")
-    if lying := [frame.image for frame, image in zip(frames, headers, strict=True) if _may_lie(image)]:
-        told = f"{and_more(lying[0], len(lying))} has an EXIF orientation that would turn it"
-        remedy = f"if the poses are those of the turned images, {_TURN}"
-        yield warning(f"{told}, which training ignores, as COLMAP does: {remedy}.")
-    if other := [frame.image for frame, image in zip(frames, headers, strict=True) if image.has_profile]:
-        told = f"{and_more(other[0], len(other))} has a colour profile, which training takes for sRGB, so that viewers"
-        yield warning(f"{told} show other colours: convert to sRGB, as ImageMagick's `mogrify -profile sRGB.icc` does.")
+        problem = f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}"
+        yield fault(f"{problem}, which leaves no pixel to train on: make white what is to be trained on.")
+    yield from _check_headers(frames, headers)
     yield note(_describe(source, headers, masks))
 
 
-def _may_lie(image: images.Header) -> bool:
+def _check_unused(frames: Sequence[images.Frame], source: Path) -> Iterator[Finding]:
+    unused = _unused_images(frames)
+    if unused:
+        where = and_more(unused[0], len(unused))
+        yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
+
+
+def _check_headers(frames: Sequence[images.Frame], headers: Sequence[images.Header]) -> Iterator[Finding]:
+    """Check good images for orientations and colour profiles, which training ignores."""
+    paths = [frame.image for frame in frames]
+    turned = [path for path, header in zip(paths, headers, strict=True) if _may_be_turned(header)]
+    if turned:
+        problem = f"{and_more(turned[0], len(turned))} has an EXIF orientation that would turn it"
+        remedy = f"if the poses are those of the turned images, {_TURN}"
+        yield warning(f"{problem}, which training ignores, as COLMAP does: {remedy}.")
+    profiled = [path for path, header in zip(paths, headers, strict=True) if header.has_profile]
+    if profiled:
+        problem = f"{and_more(profiled[0], len(profiled))} has a colour profile, which training takes for sRGB"
+        remedy = "convert to sRGB, as ImageMagick's `mogrify -profile sRGB.icc` does"
+        yield warning(f"{problem}, so that viewers show other colours: {remedy}.")
+
+
+def _may_be_turned(image: images.Header) -> bool:
     """Return whether EXIF would turn or mirror an image without a change of its size, which the pose could be of."""
-    return image.format != "TIFF" and image.orientation in (
-        images.NOT_UPRIGHT if len({*image.size}) == 1 else range(2, 5)
-    )
+    if image.format == "TIFF":
+        return False
+    width, height = image.size
+    if width == height:
+        return image.orientation in images.NOT_UPRIGHT
+    return image.orientation in images.NOT_UPRIGHT and image.orientation not in images.SIDEWAYS
 
 
 def _problem(
@@ -66,10 +86,9 @@ def _problem(
 ) -> tuple[str, Path, str] | None:
     """Return the problem of a frame's files, or None: its kind, the file and the rest of the sentence."""
     if image.problem.startswith("does not exist"):
-        places = (frame.image.parent, source.parent / "images", source.parent)
-        stem = PureWindowsPath(str(frame.image)).stem.lower()  # Windows' paths and names in other case occur.
-        if near := [path for place in places for path in images.images_in(place) if path.stem.lower() == stem]:
-            return "near", frame.image, f"does not exist, but {near[0]} does: correct the name, or save that as this"
+        similar = _image_of_similar_name(frame.image, source)
+        if similar is not None:
+            return "near", frame.image, f"does not exist, but {similar} does: correct the name, or save that as this"
     if image.problem:
         return image.problem.split(" (")[0], frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):
@@ -93,16 +112,32 @@ def _problem(
     return None
 
 
+def _image_of_similar_name(image: Path, source: Path) -> Path | None:
+    """Return an image that differs from a missing one in its folder, its case or its suffix, or None."""
+    stem = PureWindowsPath(str(image)).stem.lower()  # Windows' paths and names in other case occur.
+    for folder in (image.parent, source.parent / "images", source.parent):
+        for path in images.images_in(folder):
+            if path.stem.lower() == stem:
+                return path
+    return None
+
+
 def _describe(source: Path, headers: Sequence[images.Header], masks: Sequence[images.Header | None]) -> str:
     """Return a sentence on number, size and kind of good images, and on the number of masks."""
     sizes = Counter(image.size for image in headers)
     kinds = Counter(f"{image.format} {image.mode}" for image in headers)
     (width, height), _ = sizes.most_common(1)[0]
-    of_size = f"{width} × {height} px" + (" and other sizes" if len(sizes) > 1 else "")
-    of_kind = ", ".join(f"{kind} ({count})" if len(kinds) > 1 else kind for kind, count in kinds.most_common())
-    masked = sum(mask is not None for mask in masks)
-    count = f"with {masked}" if masked else "without"
-    text = f"{source} has {len(headers)} images of {of_size}, {of_kind}, {count} masks."
+    of_size = f"{width} × {height} px"
+    if len(sizes) > 1:
+        of_size += " and other sizes"
+    of_kind = ", ".join(kinds)
+    if len(kinds) > 1:
+        of_kind = ", ".join(f"{kind} ({count})" for kind, count in kinds.most_common())
+    num_masks = sum(mask is not None for mask in masks)
+    with_masks = "without masks"
+    if num_masks:
+        with_masks = f"with {num_masks} masks"
+    text = f"{source} has {len(headers)} images of {of_size}, {of_kind}, {with_masks}."
     if max(map(max, sizes)) > images.MAX_AUTO_RESOLUTION:
         half = "`--pipeline.datamanager.camera-res-scale-factor 0.5` trains at half their resolution"
         text += f" Images of more than {images.MAX_AUTO_RESOLUTION} px take long: {half}."
@@ -111,6 +146,9 @@ def _describe(source: Path, headers: Sequence[images.Header], masks: Sequence[im
 
 def _unused_images(frames: Sequence[images.Frame]) -> list[Path]:
     # Unlike Path.resolve, realpath does not raise where links form a loop.
-    used = {os.path.realpath(path) for frame in frames for path in (frame.image, frame.mask) if path is not None}
-    folders = sorted({frame.image.parent for frame in frames})
-    return [path for folder in folders for path in images.images_in(folder) if os.path.realpath(path) not in used]
+    used = {os.path.realpath(frame.image) for frame in frames}
+    used |= {os.path.realpath(frame.mask) for frame in frames if frame.mask is not None}
+    unused = []
+    for folder in sorted({frame.image.parent for frame in frames}):
+        unused += [path for path in images.images_in(folder) if os.path.realpath(path) not in used]
+    return unused

@@ -32,44 +32,80 @@ _EXPORTS = {
 def poses_elsewhere(data: Path) -> str | None:
     """Return the sentence for a folder with another program's poses, which a command reads, or None."""
     for pattern, (mark, command) in _EXPORTS.items():
-        if files := [file for file in sorted(data.glob(pattern)) if file.is_file() and mark in file.read_bytes()]:
-            photos = next((folder for folder in (data, *sorted(data.glob("*/"))) if images_in(folder)), data)
-            named = {"file": files[0], "photos": photos, "data": data}
-            command = command.format(**{name: shlex.quote(str(path)) for name, path in named.items()})
-            return f"{files[0]} has poses: `{command}` keeps them."
+        for file in sorted(data.glob(pattern)):
+            if file.is_file() and mark in file.read_bytes():
+                paths = {"file": file, "photos": _folder_of_photos(data), "data": data}
+                quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
+                return f"{file} has poses: `{command.format(**quoted)}` keeps them."
     return None
+
+
+def _folder_of_photos(data: Path) -> Path:
+    """Return a folder, or the first folder in it, that has images; the folder itself if none has."""
+    for folder in (data, *sorted(data.glob("*/"))):
+        if images_in(folder):
+            return folder
+    return data
 
 
 def no_layout(data: Path) -> str:
     """Return the sentence for a folder without poses."""
-    config = data if data.name == "config.yml" else data / "config.yml"
+    config = data
+    if data.name != "config.yml":
+        config = data / "config.yml"
     if config.is_file() and any(config.parent.glob("nerfstudio_models/step-*.ckpt")):
         run = shlex.quote(str(config))
         shown = f"`ns-viewer --load-config {run}` shows it"
         return f"{data} is a run and no capture: {shown}, and `sadgs-export {run} --output splat.ply` exports it."
+    if not data.exists():
+        return f"{data} does not exist: give --data the folder of a capture."
     if not data.is_dir():
-        return f"{data} {'is a file' if data.exists() else 'does not exist'}: give --data the folder of a capture."
-    if models := find_reconstructions(data):
-        told = f"{data} holds no transforms.json, but {data / next(iter(models))} holds a COLMAP reconstruction"
-        return f"{told}: leave `nerfstudio-data` out of the command."
-    around = data.absolute()
-    for other in around.parents[:3]:
-        inside = around.relative_to(other).parts[0]
-        if (inside.startswith("images") or inside in ("masks", "sparse", "colmap")) and layout_of(other) is not None:
-            return f"{data} is a part of the capture {other}: give --data that folder."
-    if kind := colmap.model_kind(data):
+        return f"{data} is a file: give --data the folder of a capture."
+    models = find_reconstructions(data)
+    if models:
+        model = data / next(iter(models))
+        problem = f"{data} holds no transforms.json, but {model} holds a COLMAP reconstruction"
+        return f"{problem}: leave `nerfstudio-data` out of the command."
+    capture = _capture_around(data.absolute())
+    if capture is not None:
+        return f"{data} is a part of the capture {capture}: give --data that folder."
+    kind = colmap.model_kind(data)
+    if kind is not None:
         first = colmap.image_names(data)[:1]
         return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
-    if told := poses_elsewhere(data):
-        return told
-    photos = data if images_in(data) else data / "images"
-    if images := images_in(photos):
+    elsewhere = poses_elsewhere(data)
+    if elsewhere is not None:
+        return elsewhere
+    photos = data
+    images = images_in(data)
+    if not images:
+        photos = data / "images"
+        images = images_in(photos)
+    if images:
         command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
         return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
-    for other in sorted(data.iterdir())[:100]:
-        if other.is_dir() and layout_of(other) is not None:
-            return f"{data} is no capture, but {other} in it is one: give --data that folder."
+    capture = _capture_inside(data)
+    if capture is not None:
+        return f"{data} is no capture, but {capture} in it is one: give --data that folder."
     return (
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _capture_around(folder: Path) -> Path | None:
+    """Return the capture around an absolute folder of images, masks or poses; None if there is none."""
+    for parent in folder.parents[:3]:
+        part = folder.relative_to(parent).parts[0]
+        is_known = part.startswith("images") or part in ("masks", "sparse", "colmap")
+        if is_known and layout_of(parent) is not None:
+            return parent
+    return None
+
+
+def _capture_inside(data: Path) -> Path | None:
+    """Return the first capture among the folders in a folder; None if there is none."""
+    for folder in sorted(data.iterdir())[:100]:
+        if folder.is_dir() and layout_of(folder) is not None:
+            return folder
+    return None

@@ -43,17 +43,22 @@ def check_splits(
     for split, listed in lists.items():
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
             raise InputError(f"{called(split)} is no list of images' names: correct it, or remove all such lists.")
-        if unknown := [name for name in listed if locate(name) not in images]:
+        unknown = [name for name in listed if locate(name) not in images]
+        if unknown:
             which = and_more(repr(unknown[0]), len(unknown))
             raise InputError(f"{called(split)} names {which}, which is no image with a pose: correct it.")
         located[split] = set(map(locate, listed))
-    if not located.get("test"):
-        state = "is empty" if "test" in located else "is missing"
-        yield warning(f"{called('test')} {state}: `ns-eval` will have nothing to measure; name some images.")
-    elif both := located["train"] & located["test"]:
-        problem = f"{called('test')} names {len(both)} of the {len(located['train'])} training images"
+    training = located["train"]
+    tests = located.get("test", set())
+    in_both = training & tests
+    if "test" not in located:
+        yield warning(f"{called('test')} is missing: `ns-eval` will have nothing to measure; name some images.")
+    elif not tests and located["val"]:
+        yield warning(f"{called('test')} is empty: `ns-eval` will have nothing to measure; name some images.")
+    elif in_both:
+        problem = f"{called('test')} names {len(in_both)} of the {len(training)} training images"
         yield warning(f"{problem}: what `ns-eval` measures of them shows nothing about new views.")
-    return len(located["train"])
+    return len(training)
 
 
 def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
@@ -63,11 +68,13 @@ def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
         return int(np.count_nonzero(np.arange(len(names)) % options.eval_interval))
     if options.eval_mode != "filename":
         return len(names)
-    for name in names:
-        if not any(word in PurePosixPath(name).name for word in ("train", "eval")):
-            told = f"{name} has neither train nor eval in its name, by which `--eval-mode filename` divides the images"
-            raise InputError(f"{told}: rename them, or leave that option out.")
-    return sum("train" in PurePosixPath(name).name for name in names)
+    files = [PurePosixPath(name).name for name in names]
+    for name, file in zip(names, files, strict=True):
+        if "train" not in file and "eval" not in file:
+            problem = f"{name} has neither train nor eval in its name"
+            cause = "by which `--eval-mode filename` divides the images"
+            raise InputError(f"{problem}, {cause}: rename them, or leave that option out.")
+    return sum("train" in file for file in files)
 
 
 def check_names(names: Iterable[str], source: Path) -> None:

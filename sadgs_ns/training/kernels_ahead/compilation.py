@@ -36,7 +36,7 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
         sh_degree=model.config.sh_degree,
         is_black=model.config.background_color == "black",
         has_color_matrices=model.color_matrices is not None,
-        alone=model.world.alone,
+        single_process=model.world.is_single,
         size=(int(sizes.width.max()), int(sizes.height.max())),
         # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
         drawing=replace(model.drawing, near_plane=NEAR_PLANE, backend=model.backend),
@@ -68,12 +68,12 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
     try:
         compile_ahead.wait()
         stages = Stages(choose_kernels(pipeline, optimizers))
-        launch(stages.alone())
+        launch(stages.without_projection())
         if launch({"rasterization": stages.project}):
             launch(stages.after_projection())
     finally:
         patience.cancel()
     if failures:
-        why = reason(next(iter(failures.values())))
-        told = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({why})"
-        warn(f"{told}: training tries them again, and stops with an error of its own if it cannot do without them.")
+        cause = reason(next(iter(failures.values())))
+        problem = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({cause})"
+        warn(f"{problem}: training tries them again, and stops with an error of its own if it cannot do without them.")

@@ -25,7 +25,7 @@ from typing import Any
 from sadgs_ns.events import progress
 
 _FEWEST_CORES = 3  # The run itself keeps two busy
-_LONGEST = 60.0  # Seconds without progress after which the run goes on alone
+_LONGEST = 60.0  # Seconds without progress after which the run no longer waits
 _HERE = Path(__file__).parent
 _CARDS = Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
@@ -35,15 +35,19 @@ _found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options
 def begin() -> None:
     """Begin to compile, unless that has begun, was done before, or there is no GPU or no spare core."""
     global _process
-    if _process is None and (marker := _marker()) and not marker.exists():
-        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-        _process = subprocess.Popen(
-            [sys.executable, "-c", code, str(marker)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+    if _process is not None:
+        return
+    marker = _marker()
+    if marker is None or marker.exists():
+        return
+    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+    _process = subprocess.Popen(
+        [sys.executable, "-c", code, str(marker)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
 
 
 def wait() -> None:
@@ -52,8 +56,14 @@ def wait() -> None:
     if _process is None:
         return
     assert _process.stdout is not None
-    told = _process.stdout.fileno()
-    while select.select([told], [], [], _LONGEST)[0] and (lines := os.read(told, 2**16)):
+    output = _process.stdout.fileno()
+    while True:
+        readable, _, _ = select.select([output], [], [], _LONGEST)
+        if not readable:
+            break
+        lines = os.read(output, 2**16)
+        if not lines:  # The process has ended.
+            break
         for done, total in re.findall(rb"(\d+) of (\d+)\n", lines)[-1:]:
             progress("compiling kernels", int(done), int(total))
     with _process:  # It ends when its input closes.
@@ -66,13 +76,17 @@ def _marker() -> Path | None:
     if not cards or len(os.sched_getaffinity(0)) < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
         return None
     try:
-        key = f"{cards} {os.environ.get('CUDA_VISIBLE_DEVICES')} {version('torch')} {version('triton')} {sys.version}"
+        versions = f"{version('torch')} {version('triton')} {sys.version}"
     except PackageNotFoundError:
         return None
-    sources = [*sorted((_HERE.parents[1] / "kernels").glob("*.py")), _HERE / "probes.py", _HERE / "compile_ahead.py"]
-    digest = hashlib.sha256(b"".join([key.encode(), *(path.read_bytes() for path in sources)])).hexdigest()
+    key = f"{cards} {os.environ.get('CUDA_VISIBLE_DEVICES')} {versions}"
+    digest = hashlib.sha256(key.encode())
+    kernels = sorted((_HERE.parents[1] / "kernels").glob("*.py"))
+    for path in (*kernels, _HERE / "probes.py", _HERE / "compile_ahead.py"):
+        digest.update(path.read_bytes())
     home = Path(os.environ.get("TRITON_HOME") or Path.home())
-    return Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache") / f"sadgs-{digest[:16]}"
+    cache = Path(os.environ.get("TRITON_CACHE_DIR") or home / ".triton" / "cache")
+    return cache / f"sadgs-{digest.hexdigest()[:16]}"
 
 
 def find_kernels() -> None:
@@ -92,15 +106,23 @@ def find_kernels() -> None:
         if (fn.name, key) not in known:
             known.add((fn.name, key))
             source = ASTSource(fn.jit_function, compile["signature"], compile["constants"], compile["configs"][0])
-            options = json.loads(compile["specialization_data"])["options"].items()
-            options = {name: tuple(value) if isinstance(value, list) else value for name, value in options}
-            _found.append((source, driver.active.get_current_target(), options))
+            target = driver.active.get_current_target()
+            options = json.loads(compile["specialization_data"])["options"]
+            for name, value in options.items():
+                if isinstance(value, list):  # JSON has no tuples.
+                    options[name] = tuple(value)
+            _found.append((source, target, options))
         return True  # Triton neither compiles nor launches it.
 
     def project(means: Any, quats: Any, scales: Any, opacities: Any, viewmats: Any, *_: Any) -> Any:
-        shape = len(viewmats), len(means)
-        radii = torch.ones((*shape, 2) if gsplat_compat.RADII_PER_AXIS else shape, dtype=torch.int32)
-        return radii, means.new_ones((*shape, 2)), means.new_ones(shape), means.new_ones((*shape, 3))
+        shape = (len(viewmats), len(means))
+        radii = torch.ones(shape, dtype=torch.int32)
+        if gsplat_compat.RADII_PER_AXIS:
+            radii = torch.ones((*shape, 2), dtype=torch.int32)
+        means2d = means.new_ones((*shape, 2))
+        depths = means.new_ones(shape)
+        conics = means.new_ones((*shape, 3))
+        return radii, means2d, depths, conics
 
     # gsplat would project on the GPU, and nothing counts pairs.
     gsplat_compat.project = project
@@ -110,7 +132,7 @@ def find_kernels() -> None:
     torch.set_num_threads(1)
     stages = Stages(KernelChoice(torch.device("cpu")))
     with triton_switched(True):
-        for stage in (*stages.alone().values(), stages.project, *stages.after_projection().values()):
+        for stage in (*stages.without_projection().values(), stages.project, *stages.after_projection().values()):
             stage()
         Stages(KernelChoice(torch.device("cpu"), size=(4096, 4096))).tile_lists()  # More tiles have longer numbers.
 

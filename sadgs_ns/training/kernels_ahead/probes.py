@@ -36,7 +36,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
-    alone: bool = True  # Whether one device holds all Gaussians
+    single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
     updates: tuple[tuple[tuple[int, ...], ...], ...] = (((3,), (15, 3), (3,), (1,), (4,), (3,)),)
@@ -66,27 +66,34 @@ class Stages:
         self.cameras = Cameras(viewmats, Ks, _SIZE, _SIZE)
         self.info: dict[str, Any] = {}  # the rasterizer's, once `project` was called
 
-    def alone(self) -> dict[str, Callable[[], None]]:
+    def without_projection(self) -> dict[str, Callable[[], None]]:
         """Return the stages that need no projection, by their names for users."""
-        stages = {
+        stages: dict[str, Callable[[], None]] = {
             "the loss": partial(self.loss, torch.uint8),
             "S̄": self.structure,
             "Adam": self.update,
             "the loss of masked images": partial(self.loss, torch.float32),
             "activations": self.activations,
         }
-        return stages | {"colour matrices": self.colors} if self.choice.has_color_matrices else stages
+        if self.choice.has_color_matrices:
+            stages["colour matrices"] = self.colors
+        return stages
 
     def after_projection(self) -> dict[str, Callable[[], None]]:
         """Return the stages that read what `project` has computed."""
-        stages = {"η": self.observation, "compositing with AbsGS": partial(self.composite, True)}
+        stages: dict[str, Callable[[], None]] = {
+            "η": self.observation,
+            "compositing with AbsGS": partial(self.composite, True),
+        }
         if self.drawing.backend == "triton":
             stages |= {
                 "projection and spherical harmonics": self.projection,
                 "tile lists": self.tile_lists,
                 "compositing": partial(self.composite, False),
             }
-        return stages if self.choice.alone else stages | {"what travels between devices": self.exchange}
+        if not self.choice.single_process:
+            stages["what travels between devices"] = self.exchange
+        return stages
 
     def project(self) -> None:
         _, _, self.info = rasterize(self.gaussians, self.cameras, self.drawing)
@@ -107,21 +114,25 @@ class Stages:
 
     def colors(self) -> None:
         shape = self.views, _SIZE, _SIZE
-        renders, alphas = (torch.zeros((*shape, k), device=self.device, requires_grad=True) for k in (3, 1))
+        renders = torch.zeros((*shape, 3), device=self.device, requires_grad=True)
+        alphas = torch.zeros((*shape, 1), device=self.device, requires_grad=True)
         matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1).requires_grad_()
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def update(self) -> None:
         from sadgs_ns.kernels.adam import adam_step
 
-        factors = torch.zeros((2, sum(map(len, self.choice.updates))), device=self.device)
-        # Several processes wait for the lengths of tile lists, which then cannot overflow.
-        flags = (torch.zeros(1, dtype=torch.int64, device=self.device),) if self.choice.alone else ()
+        num_parameters = sum(map(len, self.choice.updates))
+        factors = torch.zeros((2, num_parameters), device=self.device)
+        flags = ()
+        if self.choice.single_process:  # Several wait for the lengths of tile lists, which then cannot overflow.
+            flags = (torch.zeros(1, dtype=torch.int64, device=self.device),)
         begin = 0
         nonfinite_flag = torch.zeros(1, device=self.device)
         for shapes in self.choice.updates:
-            part = slice(begin, begin + len(shapes))
-            begin = begin + len(shapes)
+            end = begin + len(shapes)
+            part = slice(begin, end)
+            begin = end
             # Gradients and both moments may be the parameters themselves: they are all zero.
             values = tuple(self.means.new_zeros((_GAUSSIANS, *shape)) for shape in shapes)
             adam_step(
@@ -132,8 +143,9 @@ class Stages:
     def composite(self, absgrad: bool) -> None:
         gaussians = self.gaussians._replace(means=self.means.clone().requires_grad_())
         renders, alphas, info = rasterize(gaussians, self.cameras, replace(self.drawing, absgrad=absgrad))
-        opaque = self.choice.is_black and not self.choice.has_color_matrices
-        result = renders.sum() if opaque else renders.sum() + alphas.sum()
+        result = renders.sum()
+        if not self.choice.is_black or self.choice.has_color_matrices:  # Then alphas have a gradient, too.
+            result = result + alphas.sum()
         # The projection is differentiated elsewhere.
         (info["means2d"].grad2d,) = torch.autograd.grad(result, info["means2d"])
         if absgrad:
@@ -141,9 +153,10 @@ class Stages:
 
     def activations(self) -> None:
         for weight in (0.0, 1.0):  # The loss has its opacity term only while densification runs.
-            parameters = self.scales.clone().requires_grad_(), self.opacities[:, None].clone().requires_grad_()
-            some = activate(*parameters, weight)
-            torch.autograd.backward([value.sum() for value in some if value is not None])
+            scales = self.scales.clone().requires_grad_()
+            opacities = self.opacities[:, None].clone().requires_grad_()
+            values = activate(scales, opacities, weight)
+            torch.autograd.backward([value.sum() for value in values if value is not None])
 
     def projection(self) -> None:
         from sadgs_ns.kernels.harmonics import colors_from_harmonics
@@ -152,8 +165,10 @@ class Stages:
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
         radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
         results = [means2d, conics]
-        if (degree := self.choice.sh_degree) > 0:
-            rest = self.means.new_zeros((_GAUSSIANS, (degree + 1) ** 2 - 1, 3))
+        degree = self.choice.sh_degree
+        if degree > 0:
+            num_rest = (degree + 1) ** 2 - 1
+            rest = self.means.new_zeros((_GAUSSIANS, num_rest, 3))
             results.append(colors_from_harmonics(degree, centres, self.means, rest, self.cameras.viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])
 

@@ -46,7 +46,7 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
         pipeline.clear_paths(near_plane)
     length = plan_length(config, len(pipeline.views), before)
     world, peers = choose_processes(config, pipeline, length, world, peers)
-    if not world.alone:
+    if not world.is_single:
         turn_viewer_off(config)
         pipeline.model.shard(world)
     start_step = 0

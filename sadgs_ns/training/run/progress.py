@@ -36,7 +36,7 @@ def note(text: str) -> None:
 def warn(text: str) -> None:
     """Print a line in yellow, which `sadgs` shows, too."""
     if not CONSOLE.quiet:  # in all processes but the first
-        report("warning", told=text)
+        report("warning", sentence=text)
     CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True, style="yellow")
 
 

@@ -76,7 +76,7 @@ class Resumption:
     def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
         """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
         with self._errors_name_file():
-            if not world.alone:
+            if not world.is_single:
                 part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
                 self.state = checkpoints.map_rows(self.state, lambda rows: rows[part].clone())
             pipeline.load_pipeline(self.state["pipeline"], self.state["step"])

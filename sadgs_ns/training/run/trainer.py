@@ -61,7 +61,7 @@ class SadgsTrainer(Trainer):
             compile_ahead.begin()
         self.world, local_rank = processes.join(config, local_rank)
         self._peers: Peers | None = None  # There are some if several processes train.
-        if not self.world.alone:
+        if not self.world.is_single:
             self._peers = Peers(self.world)
             with processes.local_rank_zero_first(self.world, local_rank):
                 use_triton(self.world.device)  # This compiles a kernel.
@@ -74,7 +74,7 @@ class SadgsTrainer(Trainer):
         self._completed_step = -1
         self._saved_step = -1  # The last completed step that a checkpoint holds
         self._save_due = math.inf  # When a checkpoint is due, by the monotonic clock in seconds
-        self._interrupts = Interrupts(waiting=self._waits_for_user, started=not self.world.alone)
+        self._interrupts = Interrupts(waiting=self._waits_for_user, started=not self.world.is_single)
 
     def _waits_for_user(self) -> bool:
         """Tell whether nerfstudio waits for the viewer's user, as it does while a run is paused or done."""
@@ -106,7 +106,7 @@ class SadgsTrainer(Trainer):
         model = self.pipeline.model
         if not self.config.cuda_graphs or model.camera_optimizer.config.mode != "off":
             return False
-        return self.world.alone and model.backend == "triton" and model.tile_forecast is not None
+        return self.world.is_single and model.backend == "triton" and model.tile_forecast is not None
 
     def _explain(self, error: RuntimeError, full: str, remedy: str, kept: str) -> None:
         """Raise RunError instead of an error of full memory, or of one that another process caused by its end.
@@ -183,7 +183,7 @@ class SadgsTrainer(Trainer):
         """Train as nerfstudio does, unless a signal (SystemExit) or a logger's error stops the run, which saves it."""
         with self._interrupts:
             try:
-                if not self.world.alone:  # Making it as nerfstudio does fails if another process is as fast.
+                if not self.world.is_single:  # Making it as nerfstudio does fails if another process is as fast.
                     self.base_dir.mkdir(parents=True, exist_ok=True)
                 super().train()
                 self._stop_if_diverged()
@@ -193,7 +193,7 @@ class SadgsTrainer(Trainer):
                 if error.errno is None:  # This is a WriteError, or not from the disk.
                     raise
                 # A logger could not write, perhaps to another disk, or to a terminal whose SIGHUP is on its way.
-                if not self._stepping and self._completed_step > self._saved_step and self.world.alone:
+                if not self._stepping and self._completed_step > self._saved_step and self.world.is_single:
                     self.save_checkpoint(self._completed_step)
                 raise WriteError(Path(os.fsdecode(error.filename or self.base_dir)), error) from error
 
@@ -250,7 +250,7 @@ class SadgsTrainer(Trainer):
         """Stop or save if that is due; nerfstudio calls this after every step, when densification is done."""
         self._completed_step = step
         self._stepping = False
-        if self.world.alone:
+        if self.world.is_single:
             self._interrupts.poll()
             save_is_due = self._save_is_due()
         else:
@@ -269,7 +269,7 @@ class SadgsTrainer(Trainer):
 
     def eval_iteration(self, step: int) -> None:
         """Measure held-out views as nerfstudio does, if one device holds all Gaussians."""
-        if self.world.alone:
+        if self.world.is_single:
             super().eval_iteration(step)
 
     def _train_complete_viewer(self) -> None:
@@ -341,7 +341,7 @@ class SadgsTrainer(Trainer):
             "schedulers": {name: rates.state_dict() for name, rates in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        if not self.world.alone:
+        if not self.world.is_single:
             state = checkpoints.map_rows(state, self.world.gather_rows)
         if processes.is_rank_zero():
             # If the run has diverged, an earlier checkpoint may be better.

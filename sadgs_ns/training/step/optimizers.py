@@ -62,9 +62,8 @@ class AdamUpdate:
                 state["step"] = torch.tensor(0.0)
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-        self.exp_avgs, self.exp_avg_sqs = (
-            tuple(state[key] for state in self._states if state) for key in ("exp_avg", "exp_avg_sq")
-        )
+        self.exp_avgs = tuple(state["exp_avg"] for state in self._states if state)
+        self.exp_avg_sqs = tuple(state["exp_avg_sq"] for state in self._states if state)
 
     def factors(self) -> Tensor:
         """Count an update of each parameter, and return our kernel's factors, on the (pinned) host. float32 [2, P]"""

@@ -82,10 +82,10 @@ def training_step(
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
     for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
         update.parameters[name].grad = None
-    if not world.alone:
+    if not world.is_single:
         opacity_reg *= len(leaves["means"]) / world.total  # The mean is over the Gaussians of all processes.
     gaussians, penalty = model.gaussians(leaves, opacity_reg)
-    if world.alone and len(groups) == 1:
+    if world.is_single and len(groups) == 1:
         # The kernel adds the penalty to the loss of a single group.
         losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, penalty)
     else:
@@ -103,7 +103,7 @@ def training_step(
     update.launch(gradients, factors, nonfinite_flag, overflowed)
     model.strategy.accumulate(model.strategy_state, model.step, infos)
     loss = loss.detach()
-    if world.alone:
+    if world.is_single:
         psnr = reduce(torch.add, qualities)
     else:
         loss, error = world.sum(torch.stack([loss, sum(qualities, torch.zeros_like(loss))]))

@@ -128,7 +128,7 @@ class TrainingViews:
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""
         world = self.model.world
-        if not world.alone:
+        if not world.is_single:
             sizes = tuple(self.sizes[index] for index in indices)
             indices = [indices[position] for position in views_of_rank(sizes, world.num_ranks, world.rank)]
         return list(dict.fromkeys(indices))

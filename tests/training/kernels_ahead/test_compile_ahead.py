@@ -52,7 +52,7 @@ def launch(choice):
     stages = Stages(choice)
     with triton_switched(True):
         stages.project()
-        for stage in (stages.after_projection() | stages.alone()).values():
+        for stage in (stages.after_projection() | stages.without_projection()).values():
             stage()
 
 knobs.runtime.jit_cache_hook, knobs.compilation.listener = None, listen

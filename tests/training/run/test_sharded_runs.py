@@ -295,7 +295,7 @@ def train_where_it_is_quickest(world: World, config: SadgsTrainerConfig) -> dict
             trainer.setup()
     except SystemExit as ending:
         return {"code": ending.code, "ended": time.time()}
-    assert trainer.world.alone and torch.distributed.get_world_size() == 1
+    assert trainer.world.is_single and torch.distributed.get_world_size() == 1
     return train_set_up(trainer, None) | {"printed": printed.get(), "ended": time.time()}
 
 
