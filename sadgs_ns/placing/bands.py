@@ -19,6 +19,8 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
+from sadgs_ns.data.images import UNREADABLE
+
 _THERMAL = "thermal images beside photos in colour"
 _SINGLE = "images of single bands, such as near infrared, beside photos in colour"
 _THERMAL_ENDINGS = {"t", "ir", "lwir", "thermal"}
@@ -66,7 +68,7 @@ class _Picture:
             with Image.open(self.file) as image:
                 image.draft("RGB", (64, 64))
                 small = image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)
-        except Exception:  # Decoders raise whatever they stumble over.
+        except UNREADABLE:
             return False
         pixels = np.asarray(small, np.int16)
         spread = pixels.max(axis=2) - pixels.min(axis=2)
@@ -174,7 +176,7 @@ def _read(file: Path) -> _Picture | None:
         ending = name["ending"]
     try:
         image = Image.open(file)
-    except Exception:  # Decoders raise whatever they stumble over.
+    except UNREADABLE:
         return None
     with image:
         xmp = image.info.get("xmp")  # None for some HEIC files
@@ -194,7 +196,7 @@ def _camera_time(image: Image.Image) -> CameraTime | None:
     """Return which camera took a photo, and when, None if EXIF does not tell."""
     camera = ""
     text = ""
-    with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
+    with contextlib.suppress(*UNREADABLE):  # EXIF may be damaged.
         exif = Image.Image.getexif(image)  # A PNG's own method would decode the image.
         camera = f"{exif.get(ExifTags.Base.Make)} {exif.get(ExifTags.Base.Model)}"
         text = str(exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.DateTimeOriginal))

@@ -9,7 +9,7 @@ import struct
 
 from PIL import ExifTags, Image, ImageCms
 
-from sadgs_ns.data.images import color_profile
+from sadgs_ns.data.images import UNREADABLE, color_profile
 
 _CAMERA_FORMATS = ("JPEG", "MPO")
 _UNCALIBRATED = 65535  # EXIF's ColorSpace that is not sRGB
@@ -42,7 +42,7 @@ def _is_adobe_rgb_by_exif(image: Image.Image) -> bool:
     """Return whether a photo has no profile, and EXIF tells of Adobe RGB as the standard of camera files wants it."""
     if image.mode != "RGB" or image.format not in _CAMERA_FORMATS or "icc_profile" in image.info:
         return False
-    with contextlib.suppress(Exception):  # Pillow raises anything where EXIF is damaged.
+    with contextlib.suppress(*UNREADABLE):  # EXIF may be damaged.
         exif = image.getexif()
         if exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace) == _UNCALIBRATED:
             index = exif.get_ifd(ExifTags.IFD.Interop).get(_INDEX)

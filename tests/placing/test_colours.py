@@ -61,6 +61,7 @@ def test_adobe_rgb_that_exif_tells_becomes_srgb(colour: Any, orientation: int, t
         ("a.jpg", "RGB", {"exif": DAMAGED}),
     ],
 )
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF data")
 def test_other_photos_keep_their_colours(name: str, mode: str, options: dict[str, Any], tmp_path: Path):
     Image.new(mode, (32, 16), (200, 30, 30) if mode == "RGB" else 90).save(tmp_path / name, **options)
     is_unchanged, _ = converted(tmp_path, name)
