@@ -83,6 +83,7 @@ class PhotosToSplat:
             max_size=self.options.max_size,
             effort=self.options.effort,
             train_options=list(self.train_options),
+            measure=self.options.measure,
         )
         self.results.read_settings(chosen, self.given)
 
@@ -104,6 +105,7 @@ class PhotosToSplat:
             if settings.views is not None and not self.results.has_scene():  # Somebody deleted it.
                 settings.views = None
                 settings.trained = None
+                settings.measured = None
                 settings.run = f"run-{int(time.time())}"
             self.results.write_settings()
             if self.added or self.results.trained() is None:

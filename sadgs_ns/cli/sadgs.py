@@ -18,7 +18,7 @@ from rich.console import Console
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.cli.program import exit_code, parse
 from sadgs_ns.cli.sadgs_options import Sadgs
-from sadgs_ns.cli.sadgs_stages import export, place_cameras, train
+from sadgs_ns.cli.sadgs_stages import export, measure, place_cameras, train
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 
@@ -26,9 +26,12 @@ STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {
     "cameras": place_cameras,
     "training": train,
     "export": export,
+    "measures": measure,
 }
-"""The stages in their order, by the names of their lines. A stage sees by what lies in `folder` whether it was done
-before, updates its line, and returns the line's last sentence. It may raise InputError and RunError."""
+"""The stages in their order, by the names of their lines; measures only if they are asked for.
+
+A stage sees by what lies in `folder` whether it was done before, updates its line, and returns the last sentence of its
+line. It may raise InputError and RunError."""
 _FIRST_PARTS = {"cameras": ("cameras", "checks"), "training": ("start", "imports"), "export": ("export", "checks")}
 """Stage and part of the time that begin with a stage, if others than itself."""
 _LOCK_SECONDS = 10.0  # Time in which the last stage of a killed run may save
@@ -38,6 +41,8 @@ def make_splat(work: PhotosToSplat) -> list[Path]:
     """Do the stages that are not done yet, and return the splats; `exit_code` knows all errors of this."""
     with work.begin(_LOCK_SECONDS):
         for name, stage in STAGES.items():
+            if name == "measures" and not work.options.measure:
+                continue
             work.timeline.begin(*_FIRST_PARTS.get(name, (name, name)))
             with StatusLine(name, work.console) as line:
                 try:

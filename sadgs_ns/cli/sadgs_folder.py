@@ -18,6 +18,7 @@ _OPTION_NAMES = {
     "max_size": "--max-size",
     "effort": "--effort",
     "train_options": "options of ns-train",
+    "measure": "--measure",
 }
 """Names of the settings that options decide, in sentences and as keys of settings.json; other keys are fields."""
 
@@ -32,12 +33,14 @@ class Settings:
     max_size: int | None = None
     effort: float | None = None
     train_options: list[str] | None = None
+    measure: bool | None = None  # None if the folder was begun by a version that always held out one photo in ten
 
     # How far the work is
     run: str = "run"  # The name of the present run's folder
     views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
     files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
     trained: str | None = None  # The sentence of a finished training
+    measured: str | None = None  # The sentence on how well run and file show the photos that were held out
     few: str | None = None  # The sentence on the registered photos, if they are few or their cameras are wrong
 
     @classmethod
@@ -97,6 +100,8 @@ class SadgsFolder:
             self.settings = chosen
             return
         self.settings = begun
+        if begun.measure is None and begun.views is not None:
+            chosen = replace(chosen, measure=None)  # Its views stay divided as they are.
         differences = self._differences(chosen)
         if given is not None and self.checkpoint():
             differences += given.changed_images(begun.files)
@@ -112,6 +117,8 @@ class SadgsFolder:
             decided.append("max_size")
         if self.checkpoint():
             decided += ["effort", "train_options"]
+            if self.settings.cameras == "new":  # Others are divided as their capture or ns-train says.
+                decided.append("measure")
         differences = []
         for name in decided:
             before = getattr(self.settings, name)
@@ -151,4 +158,6 @@ class SadgsFolder:
 def _shown(value: Any) -> str:
     if isinstance(value, list):
         return shlex.join(value) or "none"
+    if isinstance(value, bool):
+        return "given" if value else "not given"
     return str(value)

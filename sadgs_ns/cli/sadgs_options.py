@@ -46,6 +46,8 @@ class Sadgs:
     ] = None
     anyway: bool = False
     """Continue even if fewer than half of the photos registered, or their cameras are wrong."""
+    measure: bool = False
+    """Hold every eighth photo out of training, and print in the end how well run and file show these."""
     profile: bool = False
     """Also print where the time went as a table."""
 

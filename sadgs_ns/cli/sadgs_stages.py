@@ -1,4 +1,4 @@
-"""The stages of `sadgs`: cameras, training and export.
+"""The stages of `sadgs`: cameras, training, export and, if asked for, measures.
 
 Each sees in the folder whether it was done before, shows on its line how far it is, and returns the last sentence.
 """
@@ -22,6 +22,7 @@ from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.placing.plan import Summary
 
 _PLACING = "sadgs_ns.cli.process:process"
+_MEASURING = "sadgs_ns.cli.measuring:measure"
 
 
 def place_cameras(work: PhotosToSplat, line: StatusLine) -> str:
@@ -108,6 +109,7 @@ def train(work: PhotosToSplat, line: StatusLine) -> str:
         return f"{trained}; done before"
     is_resumed = results.checkpoint() is not None
     results.settings.trained = None  # The folder of an earlier run may have been deleted.
+    results.settings.measured = None
     if is_resumed:
         line.update("going on")
     else:
@@ -215,3 +217,23 @@ class _ExportProgress:
         elif event == "export ends":
             megabytes = Path(output).stat().st_size / 1e6
             self.finished.append(f"{output}, {megabytes:,.1f} MB")
+
+
+def measure(work: PhotosToSplat, line: StatusLine) -> str:
+    """Measure how well run and file show the photos that were held out, unless that was done before."""
+    settings = work.results.settings
+    if settings.measured:
+        return f"{settings.measured}; done before"
+    line.update("starting")
+    worker = work.worker("measures", _MEASURING)
+
+    def on_event(event: str, **fields: Any) -> None:
+        if event == "progress":
+            line.update(f"{fields['stage']} {fields['done']} of {fields['total']}")
+        elif event == "warning":
+            line.print(fields["sentence"])
+
+    settings.measured = work.call(worker, line, on_event, [], work.results.run, work.data)
+    work.results.write_settings()
+    assert settings.measured is not None
+    return settings.measured

@@ -270,7 +270,7 @@ class SadgsPipeline(VanillaPipeline):
         if views == 0:
             raise InputError(
                 "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
-                "--eval-mode that holds out some."
+                "--eval-mode that holds out some, or with `sadgs … --measure`."
             )
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 from PIL import Image
 from rich.console import Console
 
@@ -186,7 +185,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
 
 @pytest.mark.hard_case(
     "photos added to the folder of a finished `sadgs`, interrupted in each stage",
-    "cameras are added, and another run is trained in the same frame, with the same held-out views; the "
+    "cameras are added, and another run is trained on all photos in the same frame; the "
     "earlier splat and run stay until the new one is written",
 )
 def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was(
@@ -227,9 +226,8 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     assert not first.exists() and splat.read_bytes() != written
     assert (second / "dataparser_transforms.json").read_bytes() == moved, "the splat stays where it was"
     described = json.loads((folder / "scene" / "transforms.json").read_text())
-    held_out = get_train_eval_split_fraction(sorted(set(names) - set(later)), 0.9)[1]
-    assert described["test_filenames"] == [f"images/{sorted(set(names) - set(later))[i]}" for i in held_out]
-    assert len(described["train_filenames"]) == 10 - len(held_out)
+    assert described["train_filenames"] == [f"images/{name}" for name in names], "all photos are trained on"
+    assert described["val_filenames"] == described["test_filenames"] == []
 
     finish_again(command, folder, capsys)
     (source / "03.png").unlink()
@@ -239,8 +237,10 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
 
 
 def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_split(photos: Path, tmp_path: Path):
+    """In a folder that an earlier version began, nine photos in ten are trained on."""
     work = PhotosToSplat(Sadgs(photos, tmp_path / "out"), [], Console(quiet=True))
     work.results.scene.mkdir(parents=True)
+    work.results.settings.measure = None
 
     def choose(number: int) -> dict[str, Any]:
         file = work.results.scene / "transforms.json"
@@ -502,6 +502,7 @@ def test_settings_that_an_earlier_version_wrote_are_read(
     assert "(--effort was 0.5, is 1.0); give another --output or delete it." in capsys.readouterr().err
     assert main([*command, "--effort", "0.5"]) == 2
     assert "(options of ns-train was --max-num-iterations 8, is none); give" in capsys.readouterr().err
+    assert "test_filenames" not in json.loads((out / "scene" / "transforms.json").read_text()), "its division stays"
 
 
 @pytest.mark.hard_case(

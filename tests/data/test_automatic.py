@@ -477,6 +477,10 @@ def test_lists_without_test_images_and_with_training_images_among_them_are_warne
     assert warning() == "is missing: `ns-eval` will have nothing to measure; name some images."
     content["test_filenames"] = []
     assert warning() == "is empty: `ns-eval` will have nothing to measure; name some images."
+    content |= {"train_filenames": names, "val_filenames": []}
+    path.write_text(json.dumps(content))
+    assert not [finding for finding in check_data(tmp_path) if finding.severity != "note"], "all shall be trained on"
+    content |= {"train_filenames": names[2:], "val_filenames": names[:2]}
     content["test_filenames"] = [f"./{names[0]}", names[2], names[3]]
     assert warning() == (
         "names 2 of the 8 training images: what `ns-eval` measures of them shows nothing about new views."

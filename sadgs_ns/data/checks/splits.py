@@ -53,7 +53,7 @@ def check_splits(
     in_both = training & tests
     if "test" not in located:
         yield warning(f"{called('test')} is missing: `ns-eval` will have nothing to measure; name some images.")
-    elif not tests:
+    elif not tests and located["val"]:
         yield warning(f"{called('test')} is empty: `ns-eval` will have nothing to measure; name some images.")
     elif in_both:
         problem = f"{called('test')} names {len(in_both)} of the {len(training)} training images"
