@@ -45,7 +45,6 @@ class Loss:
 
 VARIANTS: dict[str, Loss | None] = {
     "released": None,
-    "filtered": Loss("CAUCHY", 1.0, 1e-3, filters_first=True),
     "squared": Loss("TRIVIAL", 1.0, 1e-5, filters_first=True),
     "cauchy-0.5": Loss("CAUCHY", 0.5, 1e-3),
     "soft-l1": Loss("SOFT_L1", 1.0, 1e-3),
@@ -139,7 +138,7 @@ class Command:
     only: tuple[str, ...] = ()
     """captures to measure; the default is all"""
     variant: tuple[str, ...] = ()
-    """losses of the last adjustment: released, filtered, squared, cauchy-0.5, soft-l1; the default is all"""
+    """losses of the last adjustment: released, squared, cauchy-0.5, soft-l1; the default is all"""
 
     def jobs(self) -> list[Job]:
         """Return what is asked for; raise ValueError if there is no such capture, variant or folder."""

@@ -52,6 +52,7 @@ def refine(model: pycolmap.Reconstruction, database: Path, options: pycolmap.Inc
     for image_id in model.reg_image_ids():
         mapper.triangulate_image(options.get_triangulation(), image_id)
     mapper.end_reconstruction(discard=False)
+    filter_observations(model)  # Some of those that were triangulated again are wrong.
 
 
 def adjust_robustly(
