@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,6 +20,11 @@ from sadgs_ns.errors import reason
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp"}
 """Suffixes of the formats of photos that training reads."""
 MAX_AUTO_RESOLUTION = 1600  # Longest side in px up to which nerfstudio looks for no smaller copies of images
+UNREADABLE = (
+    OSError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow raises where an image is damaged. Only its functions are called where this is caught, so that a mistake
+in others is not taken for damage."""
 NOT_UPRIGHT = range(2, 9)  # EXIF's orientations of turned or mirrored images. Pillow turns TIFF by itself, but no other
 SIDEWAYS = range(5, 9)  # Those of them that exchange the sides
 Rounding = Literal["floor", "round", "ceil"]

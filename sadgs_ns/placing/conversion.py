@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
-from sadgs_ns.data.images import color_profile
 from sadgs_ns.errors import InputError
+from sadgs_ns.placing.bit_depth import read_scaled
+from sadgs_ns.placing.colours import profile_of
 from sadgs_ns.placing.panoramas import cut
 from sadgs_ns.placing.photos import Photo, empty_folder, threads
 
@@ -66,8 +67,12 @@ def _convert(photo: Photo, folder: Path, target: Path) -> None:
             exif = Image.Exif()
             if image.format != "TIFF":  # A TIFF's tells of its pixels, too.
                 exif = image.getexif()
+            profile = profile_of(image)
             image.info.pop("exif", None)  # Pillow would write it anew, which fails where it is damaged.
-            pixels = _upright_pixels(image, photo)
+            stored: Image.Image = image
+            if photo.bit_depth is not None:
+                stored = read_scaled(image, source, photo.bit_depth)
+            pixels = _upright_pixels(stored, photo, profile)
             kept = _without_orientation(exif)  # Only now, since `image` needs it to be turned.
             parts = [pixels]
             if photo.is_panorama:
@@ -89,8 +94,8 @@ def _without_orientation(exif: Image.Exif) -> bytes:
     return b""
 
 
-def _upright_pixels(image: Image.Image, photo: Photo) -> Image.Image:
-    """Turn an image as its EXIF data says, and convert it to sRGB unless it has 16 bits."""
+def _upright_pixels(image: Image.Image, photo: Photo, profile: ImageCms.ImageCmsProfile | None) -> Image.Image:
+    """Turn an image as its EXIF data says, and convert it from its profile to sRGB unless it is grey of 16 bits."""
     if photo.is_turned:
         image = ImageOps.exif_transpose(image)
     if image.mode == "I;16":
@@ -98,12 +103,11 @@ def _upright_pixels(image: Image.Image, photo: Photo) -> Image.Image:
     mode = "RGB"
     if photo.has_alpha:
         mode = "RGBA"
-    return _in_srgb(image, mode)
+    return _in_srgb(image, profile, mode)
 
 
-def _in_srgb(image: Image.Image, mode: str) -> Image.Image:
-    """Convert an image to RGB or RGBA in sRGB, since training and viewers know no profiles."""
-    profile = color_profile(image)
+def _in_srgb(image: Image.Image, profile: ImageCms.ImageCmsProfile | None, mode: str) -> Image.Image:
+    """Convert an image from its profile to RGB or RGBA in sRGB, since training and viewers know no profiles."""
     if profile is None:
         return image.convert(mode)
     if image.mode != "CMYK":

@@ -7,7 +7,6 @@ import filecmp
 import math
 import os
 import re
-import struct
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -15,21 +14,17 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.data.images import IMAGE_SUFFIXES, image_size
+from sadgs_ns.data.images import IMAGE_SUFFIXES, UNREADABLE, image_size
 from sadgs_ns.data.layouts import automatic_options
 from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings
+from sadgs_ns.placing.bands import other_bands
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
-_UNREADABLE = (
-    OSError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error, Image.DecompressionBombError,
-)  # fmt: skip
-"""What Pillow raises where an image is damaged. Only its functions are called where this is caught, so that a mistake
-in others is not taken for damage."""
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
@@ -135,6 +130,9 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     found["copies of others"] = copies = _copies(folder, photos, known)
     found["panoramas of a part of the view"] = swept = [p for p in photos if p not in known and _is_swept(folder / p)]
     photos = [name for name in photos if name not in {*copies, *swept}]
+    bands = other_bands(folder, photos, known)
+    found.update(bands)
+    photos = sorted({*photos}.difference(*bands.values()))
     for name in photos:
         stems[_stem(name)].append(name)
     for name in maps:
@@ -158,7 +156,7 @@ def _kind(path: Path) -> str:
         start = file.read(12)
     if suffix in IMAGE_SUFFIXES and start[4:8] not in (b"ftyp", b"JXL ") and start[:2] != b"\xff\x0a":
         return "photos"
-    with contextlib.suppress(*_UNREADABLE), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
+    with contextlib.suppress(*UNREADABLE), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
         kind = image.format
     if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
         return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
@@ -176,7 +174,7 @@ def _is_mask(path: Path) -> bool:
     try:
         with Image.open(path) as image:
             small = image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)
-    except _UNREADABLE:  # A damaged image is named when it is read.
+    except UNREADABLE:  # A damaged image is named when it is read.
         return False
     pixels = np.asarray(small).reshape(-1, 3)
     is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
@@ -190,7 +188,7 @@ def _is_swept(path: Path) -> bool:
             size = image.size
             lens = Image.Image.getexif(image).get_ifd(ExifTags.IFD.Exif)
             xmp = image.info.get("xmp", b"")
-    except _UNREADABLE:  # A damaged photo is named when it is read.
+    except UNREADABLE:  # A damaged photo is named when it is read.
         return False
     is_whole = size[0] == 2 * size[1]
     by_apple = lens.get(ExifTags.Base.CustomRendered) == 6
@@ -239,5 +237,5 @@ def _read_grey(path: Path) -> Image.Image | None:
         with Image.open(path) as image:
             image.draft("L", (64, 64))
             return ImageOps.exif_transpose(image).convert("L")
-    except _UNREADABLE:
+    except UNREADABLE:
         return None

@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, UnidentifiedImageError
 
-from sadgs_ns.data.images import NOT_UPRIGHT, SIDEWAYS, color_profile
+from sadgs_ns.data.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.host_memory import available_host_bytes
+from sadgs_ns.placing.bit_depth import largest_value
+from sadgs_ns.placing.colours import profile_of
 from sadgs_ns.placing.folder import COLMAP_FORMATS
 from sadgs_ns.placing.panoramas import VIEWS, is_panorama
 
@@ -40,6 +42,8 @@ class Photo:
     is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
     is_panorama: bool = False
     has_focal_length: bool = False  # Whether EXIF tells one
+    largest_value: int | None = None  # Of its colours if its file has more than 8 bits a value
+    bit_depth: int | None = None  # Bits that its values use if these are to be scaled
 
     @property
     def views(self) -> list[Photo]:
@@ -129,7 +133,7 @@ def _read_photo(folder: Path, name: str) -> Photo:
         camera = (size, exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model), *focals)
         has_alpha = image.has_transparency_data
         is_read = image.format in COLMAP_FORMATS and image.mode not in ("CMYK", "LAB")  # A TIFF would stay CMYK.
-        if color_profile(image) is not None:
+        if profile_of(image) is not None:
             is_read = False
         # An eighth of a JPEG's size tells whether it is whole, but not whether it is a panorama.
         draft_width = width // 8
@@ -141,7 +145,8 @@ def _read_photo(folder: Path, name: str) -> Photo:
         image.load()
         is_turned = orientation in NOT_UPRIGHT
         is_whole_view = is_panorama(image, size)
-        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_whole_view, has_focal_length)
+        largest = largest_value(image, folder / name)
+        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_whole_view, has_focal_length, largest)
 
 
 def empty_folder(folder: Path) -> Path:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sadgs_ns.data.checks.layouts import poses_elsewhere
+from sadgs_ns.placing import bit_depth
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_alpha, write_masks
 from sadgs_ns.placing.folder import find_videos
@@ -123,6 +124,8 @@ def _read_folder(scene: Scene, lock: contextlib.ExitStack, report: Report) -> li
     source = scene.options.source
     names = scene.settings.photos
     photos = read_photos(source, names, report)
+    scene.settings.bit_depth = _choose_bit_depth(scene, photos)
+    photos = _scale_values(photos, scene.settings.bit_depth)
     stamps: dict[str, list[int]] = {}
     if scene.begun is not None:
         stamps = scene.begun.files
@@ -134,8 +137,36 @@ def _read_folder(scene: Scene, lock: contextlib.ExitStack, report: Report) -> li
     return photos
 
 
+def _choose_bit_depth(scene: Scene, photos: Sequence[Photo]) -> int | None:
+    """Return the bits that the values of photos of 16 bits use, None if there are no such photos.
+
+    It stays as it was chosen first, so that photos that are added later are as bright as the others.
+    """
+    largest_values = {photo.name: photo.largest_value for photo in photos if photo.largest_value is not None}
+    if scene.begun is not None:
+        if scene.begun.bit_depth is not None:
+            return scene.begun.bit_depth
+        if not largest_values.keys().isdisjoint(scene.begun.photos):
+            return bit_depth.WHOLE  # An earlier version took them for this.
+    if not largest_values:
+        return None
+    return bit_depth.depth_of(largest_values.values())
+
+
+def _scale_values(photos: Sequence[Photo], depth: int | None) -> list[Photo]:
+    """Let photos of 16 bits be scaled if their values use fewer, which is a matter of all photos together."""
+    if depth is None or depth == bit_depth.WHOLE:
+        return list(photos)
+    scaled = []
+    for photo in photos:
+        if photo.largest_value is not None:
+            photo = dataclasses.replace(photo, is_read=False, bit_depth=depth)
+        scaled.append(photo)
+    return scaled
+
+
 def _describe_photos(scene: Scene, photos: Sequence[Photo], say: Say) -> None:
-    """Say how many photos were added, and how many are panoramas."""
+    """Say how many photos were added, how many are panoramas, and how many use a part of 16 bits."""
     if scene.added and scene.begun is not None:
         if scene.added == 1:
             added = "1 photo"
@@ -148,6 +179,9 @@ def _describe_photos(scene: Scene, photos: Sequence[Photo], say: Say) -> None:
         found = f"{panoramas} of the {len(photos)} photos are panoramas"
         views = f"each is cut into {VIEWS} views of 90°, which leave out 30° about the zenith and the nadir"
         say("panoramas", f"{found}: {views}.")
+    largest_values = [photo.largest_value for photo in photos if photo.bit_depth and photo.largest_value is not None]
+    if largest_values and scene.settings.bit_depth:
+        say("aside", bit_depth.sentence_on_depth(scene.settings.bit_depth, largest_values))
 
 
 def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> tuple[Path, list[Photo]]:

@@ -30,6 +30,8 @@ class SceneSettings:
     frames: int | None = None  # None for photos
     files: dict[str, list[int]] = dataclasses.field(default_factory=dict)
     """Stamps, by `photo_stamps`, of the photos and masks, or videos."""
+    bit_depth: int | None = None
+    """Bits that the values of photos of 16 bits use; None until there are such, or if an earlier version began it."""
     max_size: int | None = None  # None until the scene is finished, because until then it may change
     finished: dict[str, Any] | None = None  # The fields of the finished scene's `Summary`
     model: str = "model"  # Folder of the finished scene's model, in the work folder

@@ -15,6 +15,9 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
 
 _HDR = (16, 18)  # FFmpeg's numbers of PQ and HLG, in which phones record unless they are told otherwise
+_BT_709 = 1  # FFmpeg's number of this matrix from colours to luma and chroma
+_NO_MATRIX = 2  # FFmpeg's number of a frame that names none
+_HD_SIZE = (1280, 720)  # Width and height in px, either of which makes a video HD
 
 
 def count_frames(video: Path) -> int:
@@ -78,7 +81,18 @@ def sharpest_frames(video: Path, count: int, total: int) -> Iterator[tuple[int, 
             to_sdr = "out_transfer=iec61966-2-1:out_primaries=bt709"
             chosen = filtered(chosen, stream, ("scale", to_sdr), ("format", "bgr24"))
         for number, frame in enumerate(chosen):
-            yield number, np.rot90(frame.to_ndarray(format="bgr24"), frame.rotation // 90)
+            yield number, np.rot90(pixels_of(frame), frame.rotation // 90)
+
+
+def pixels_of(frame: Any) -> np.ndarray:
+    """Return the colours of PyAV's frame, by its own matrix if it names one. BGR [H, W, 3]
+
+    FFmpeg takes a frame that names none for BT.601. That is the matrix of SD alone: HD has BT.709, as players know.
+    """
+    is_hd = frame.width >= _HD_SIZE[0] or frame.height >= _HD_SIZE[1]
+    if is_hd and frame.colorspace == _NO_MATRIX:
+        frame.colorspace = _BT_709
+    return frame.to_ndarray(format="bgr24")
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:

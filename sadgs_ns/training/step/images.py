@@ -6,22 +6,22 @@ import copy
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.training.run.processes import processes_on_this_machine
+from sadgs_ns.training.step.undistortion import Undistortion
 
-_Undistort = Callable[[dict[str, Any], NDArray[Any]], tuple[NDArray[np.float32], NDArray[Any], Tensor | None]]
-"""Takes data and image [H, W(, C)]; returns intrinsics in px [3, 3], image, and perhaps mask [H, W, 1] undistorted."""
+_KEPT_WARPS = 4  # Cameras whose warps are kept, at 8 bytes a pixel; each image may have a camera of its own
 
 
 def thread_count(requested: int | None) -> int:
@@ -49,7 +49,7 @@ def stack_masks(data: Sequence[Mapping[str, Any]], size: Sequence[int], device: 
 
 
 class LazyImages(Sequence[dict[str, Any]]):
-    """Images of a dataset as nerfstudio's FullImageDatamanager loads and undistorts them, decoded at each access.
+    """Images of a dataset as nerfstudio's FullImageDatamanager loads them, decoded and undistorted at each access.
 
     Several threads may access images. The dataset's cameras become those of the undistorted images, none opened.
     """
@@ -57,7 +57,8 @@ class LazyImages(Sequence[dict[str, Any]]):
     def __init__(self, dataset: InputDataset) -> None:
         self._names = dataset.image_filenames
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
-        self._undistort = _undistort_cameras(dataset.cameras)
+        self._undistortions = _undistort_cameras(dataset.cameras)
+        self._warp_of = lru_cache(_KEPT_WARPS)(Undistortion.warp)
         self._dataset = copy.copy(dataset)
         self._opencv_agrees: bool | None = None  # None until a JPEG has been decoded
         if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
@@ -73,7 +74,7 @@ class LazyImages(Sequence[dict[str, Any]]):
         """
         name = self._names[index]
         size = tuple(self._sizes[index])
-        undistort = self._undistort[index]
+        undistortion = self._undistortions[index]
         try:
             data = self._dataset.get_data(index, image_type="uint8")
         except MemoryError:
@@ -91,8 +92,8 @@ class LazyImages(Sequence[dict[str, Any]]):
         if width_and_height != size:
             sizes = "{} × {} px, but its camera {} × {}".format(*width_and_height, *size)
             raise InputError(f"{name} has {sizes}: use the images that the poses were computed from.")
-        if undistort is not None:
-            _, undistorted, mask = undistort(data, image.numpy())
+        if undistortion is not None:
+            undistorted, mask = undistortion(data, image.numpy(), self._warp_of(undistortion))
             image = torch.from_numpy(np.ascontiguousarray(undistorted))  # The crop is a view of the larger image.
             if mask is not None:
                 data["mask"] = mask.contiguous()
@@ -117,38 +118,28 @@ class LazyImages(Sequence[dict[str, Any]]):
         return expected
 
 
-def _undistort_cameras(cameras: Cameras) -> list[_Undistort | None]:
+def _undistort_cameras(cameras: Cameras) -> list[Undistortion | None]:
     """Give cameras their undistorted images' intrinsics and sizes; return what undistorts each image, or None."""
-    undistorts: list[_Undistort | None] = [None] * len(cameras)
+    undistortions: list[Undistortion | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
     if distortion is None or not distortion.any():
-        return undistorts
+        return undistortions
     fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
     rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
-    known: dict[bytes, tuple[_Undistort, NDArray[np.float32], NDArray[Any]]] = {}
+    known: dict[bytes, Undistortion] = {}
     for index in distortion.any(dim=-1).nonzero().flatten().tolist():
         row = rows[index].tobytes()
         if row not in known:
-            undistort = _undistort_as(cameras[index].reshape(()))
-            # The new intrinsics do not depend on the pixels.
-            empty = np.zeros((int(cameras.height[index]), int(cameras.width[index])), np.uint8)
-            known[row] = undistort, *undistort({}, empty)[:2]
-        undistorts[index], K, image = known[row]
-        cameras.fx[index] = float(K[0, 0])
-        cameras.fy[index] = float(K[1, 1])
-        cameras.cx[index] = float(K[0, 2])
-        cameras.cy[index] = float(K[1, 2])
-        cameras.width[index] = image.shape[1]
-        cameras.height[index] = image.shape[0]
-    return undistorts
-
-
-def _undistort_as(camera: Cameras) -> _Undistort:
-    """Return a function that undistorts images of a camera, without batch dimension, as it is now."""
-    camera = copy.deepcopy(camera)
-    K = camera.get_intrinsics_matrices().numpy()
-    distortion = camera.distortion_params.numpy()  # type: ignore[union-attr]
-    return lambda data, image: _undistort_image(camera, distortion, data, image, K.copy())
+            known[row] = Undistortion(cameras[index].reshape(()))
+        undistortion = known[row]
+        undistortions[index] = undistortion
+        cameras.fx[index] = float(undistortion.K[0, 0])
+        cameras.fy[index] = float(undistortion.K[1, 1])
+        cameras.cx[index] = float(undistortion.K[0, 2])
+        cameras.cy[index] = float(undistortion.K[1, 2])
+        cameras.width[index] = undistortion.width
+        cameras.height[index] = undistortion.height
+    return undistortions
 
 
 class ImagePrefetcher:
