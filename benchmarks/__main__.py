@@ -33,6 +33,7 @@ COMMANDS = {
     "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
+    "cameras": ("cameras:Command", "how accurately cameras are placed, with several seeds and losses"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
 }

@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from tyro.conf import Positional
 
-from benchmarks import chain_table, table
+from benchmarks import camera_table, chain_table, table
 from benchmarks.table import Change, Run
 from sadgs_ns.files import atomic_path
 
@@ -102,6 +102,14 @@ class Source:
     def chain(self, rows: str, labels: Mapping[str, str]) -> str:
         """What `benchmarks.chain` measured, a line for each capture and label."""
         return chain_table.markdown(self.read(rows), labels)
+
+    def cameras(self, rows: str, labels: Mapping[str, str]) -> str:
+        """What `benchmarks.cameras` measured of captures, a line for each capture, label and variant."""
+        return camera_table.markdown(self.read(rows), labels)
+
+    def true_cameras(self, rows: str, labels: Mapping[str, str]) -> str:
+        """What `benchmarks.cameras` measured of drawn captures, a line for each, label and variant."""
+        return camera_table.markdown_of_truths(self.read(rows), labels)
 
     def peers_drawn(self, lines: Sequence[Mapping[str, Any]], elsewhere: Sequence[Mapping[str, Any]] = ()) -> list[Any]:
         """Arguments of `plots.peers`."""

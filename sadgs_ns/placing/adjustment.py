@@ -55,7 +55,10 @@ def refine(model: pycolmap.Reconstruction, database: Path, options: pycolmap.Inc
 
 
 def adjust_robustly(
-    model: pycolmap.Reconstruction, fixed_cameras: Collection[int] = (), fixed_frames: Collection[int] = ()
+    model: pycolmap.Reconstruction,
+    fixed_cameras: Collection[int] = (),
+    fixed_frames: Collection[int] = (),
+    options: pycolmap.BundleAdjustmentOptions | None = None,
 ) -> None:
     """Adjust all cameras and points of a model by Cauchy's loss.
 
@@ -63,6 +66,7 @@ def adjust_robustly(
         model: Changed in place.
         fixed_cameras: Cameras whose intrinsics stay. Those that the model lacks do not matter.
         fixed_frames: Frames whose poses stay. Without any, COLMAP holds two cameras to keep the model in its place.
+        options: Another loss or tolerance than that of `robust_options`, for comparisons.
     """
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
@@ -79,11 +83,18 @@ def adjust_robustly(
                 config.set_constant_sensor_from_rig_pose(sensor)
     if not held:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_bundle_adjuster(robust_options(), config, model)
+    if options is None:
+        options = robust_options()
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, model)
     adjuster.solve()
     # The loss lets go of points that do not fit, even of some behind their cameras.
-    pycolmap.ObservationManager(model).filter_all_points3D(_MOST_ERROR, _LEAST_ANGLE)
+    filter_observations(model)
     model.update_point_3d_errors()
+
+
+def filter_observations(model: pycolmap.Reconstruction) -> None:
+    """Leave out observations of a model that do not fit, and points that are seen from hardly more than one side."""
+    pycolmap.ObservationManager(model).filter_all_points3D(_MOST_ERROR, _LEAST_ANGLE)
 
 
 def robust_options() -> pycolmap.BundleAdjustmentOptions:

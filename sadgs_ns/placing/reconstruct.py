@@ -36,7 +36,7 @@ from sadgs_ns.placing.undistortion import undistort
 if TYPE_CHECKING:
     import torch
 
-_SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
+SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
 _TRIALS = 2000
 """Random samples after which COLMAP gives up on a pair of photos. Its own 10,000 take three times as long, for pairs
 with hardly anything in common, and find no more matches in the others."""
@@ -156,7 +156,7 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
 
 def match(
     names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None,
-    rigs: Sequence[Sequence[str]] = (),
+    rigs: Sequence[Sequence[str]] = (), seed: int = SEED,
 ) -> None:  # fmt: skip
     """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
@@ -167,7 +167,7 @@ def match(
     stage = f"matches ({matching})"
     pair_list = database.with_name("pairs.txt")
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = _SEED
+    verification.ransac.random_seed = seed
     verification.ransac.max_num_trials = _TRIALS
     progress(stage, 0, 1)
     if matching == "similar":
@@ -193,7 +193,7 @@ def match(
 
 def place_cameras(
     photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None,
-    alike: Sequence[Sequence[str]] = (),
+    alike: Sequence[Sequence[str]] = (), seed: int = SEED,
 ) -> None:  # fmt: skip
     """Estimate cameras and points, and write the best model; its folder appears when it is complete.
 
@@ -201,7 +201,7 @@ def place_cameras(
     new photos, and photos that did not register before are tried again. Cameras of photos that are `alike`, as of
     `make_model`, are joined if they are one and the model suffices. Raise InputError if no photos could be related.
     """
-    search = _Search.of(photos, names, database, model, base)
+    search = _Search.of(photos, names, database, model, base, seed)
     best = search.attempt("cameras", {})
     attempts = ""
     quality = search.quality(best)
@@ -262,9 +262,12 @@ class _Search:
     before: pycolmap.Reconstruction | None  # That model
     total: int  # Number of frames, each a photo or a panorama
     fixed_cameras: set[int]  # Cameras whose intrinsics stay
+    seed: int
 
     @classmethod
-    def of(cls, photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None) -> _Search:
+    def of(
+        cls, photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None, seed: int
+    ) -> _Search:
         with pycolmap.Database.open(database) as opened:
             total = opened.num_frames()
             rigs = [rig for rig in opened.read_all_rigs() if rig.num_sensors() > 1]
@@ -273,7 +276,7 @@ class _Search:
         if base is not None:
             before = pycolmap.Reconstruction(base)
             fixed |= set(before.cameras)
-        return cls(photos, names, database, model.with_name("models"), base, before, total, fixed)
+        return cls(photos, names, database, model.with_name("models"), base, before, total, fixed, seed)
 
     @property
     def held_frames(self) -> list[int]:
@@ -288,7 +291,9 @@ class _Search:
         if self.before is not None:
             chosen = {"multiple_models": False, "fix_existing_frames": True, "image_names": list(self.names)}
         chosen |= {"constant_cameras": self.fixed_cameras, "ba_refine_sensor_from_rig": False}
-        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False, **_ADJUSTMENT, **chosen)
+        options = pycolmap.IncrementalPipelineOptions(
+            random_seed=self.seed, extract_colors=False, **_ADJUSTMENT, **chosen
+        )
         # Points that hold no photo wait for the last adjustment.
         skips_points = not self.fixed_cameras
         options.mapper.mergedict({**_PLACING, "ba_global_ignore_redundant_points3D": skips_points, **limits})

@@ -21,7 +21,7 @@ from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
-PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem != "chain")  # that is of `chain.load`
+PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in ("chain", "placing"))
 OPTIONS = {"colmap_path": "sparse/0", "downscale_factor": 4}
 
 

@@ -58,6 +58,8 @@ RUN_BY = {
     "test_every_row_is_printed_and_written",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
+    "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
+    "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",
     "python -m benchmarks documents": "tests/repository/test_docs.py::test_tables_are_what_their_rows_give",
 }
 """Tests that run commands which begin so, or files that do; the longest beginning counts."""
