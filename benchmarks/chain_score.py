@@ -3,8 +3,7 @@
 The score reads the photos as they were taken, the cameras with their distortion that `sadgs-process` placed, and the
 file; nothing that was undistorted or trained on enters it. The file is drawn at twice the photo's size by a pinhole
 camera, warped through the photo's distorted camera and reduced by area. The photo is reduced by area, too, if it is
-longer than the images of training. Other programs' viewers draw from `NEAR_PLANE` on and without a limit off the axis,
-so the score does.
+longer than the images of training. The file is drawn as other programs' viewers do (`sadgs_ns.cli.splat_file`).
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import json
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,47 +22,14 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
-from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.render.rasterization import rasterize
-from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
+from sadgs_ns.cli import splat_file
+from sadgs_ns.cli.splat_file import Splat, read_splat
+from sadgs_ns.render.types import Cameras
 
 Array = NDArray[np.float32]
 ENLARGED = 2  # Factor of the size at which the file is drawn, so that warping costs no detail
 MARGIN = 8  # px around what the photo sees, for the warp's kernel
 MOST_SIDE = 4.0  # Largest side of the drawn image, in those of the enlarged photo: lenses of 150° need more
-
-
-@dataclass(frozen=True)
-class Splat:
-    """The Gaussians of a file, activated."""
-
-    gaussians: Gaussians
-    degree: int
-
-
-def read_splat(file: Path, device: torch.device) -> Splat:
-    """Read a PLY in the layout of the original 3D Gaussian splatting code."""
-    from plyfile import PlyData
-
-    vertex = PlyData.read(str(file))["vertex"]
-
-    def columns(names: Sequence[str]) -> torch.Tensor:
-        values = np.stack([np.asarray(vertex[name], np.float32) for name in names], axis=1)
-        return torch.from_numpy(values).to(device)
-
-    rest = sum(name.startswith("f_rest_") for name in vertex.data.dtype.names)
-    bands = rest // 3
-    means = columns(["x", "y", "z"])
-    harmonics = columns([f"f_rest_{i}" for i in range(rest)]) if rest else means.new_zeros((len(means), 0))
-    gaussians = Gaussians(
-        means=means,
-        quats=columns([f"rot_{i}" for i in range(4)]),
-        scales=columns([f"scale_{i}" for i in range(3)]).exp(),
-        opacities=columns(["opacity"])[:, 0].sigmoid(),
-        # The file has colour before band.
-        colors=(columns([f"f_dc_{i}" for i in range(3)]), harmonics.view(-1, 3, bands).mT.contiguous()),
-    )
-    return Splat(gaussians, round(math.sqrt(1 + bands)) - 1)
 
 
 def read_photo(file: Path, max_size: int) -> Array:
@@ -108,8 +73,7 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
     pose = torch.eye(4, device=device)
     pose[:3] = torch.from_numpy(viewmat).to(pose)
     cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
-    image, _, _ = rasterize(splat.gaussians, cameras, RenderOptions(sh_degree=splat.degree, near_plane=NEAR_PLANE))
-    pinhole = image[0].clamp(0, 1).cpu().numpy()
+    pinhole = splat_file.draw(splat, cameras)[0].cpu().numpy()
     # OpenCV numbers pixels by their centres.
     at_x = (drawn_x - left - 0.5).astype(np.float32)
     at_y = (drawn_y - top - 0.5).astype(np.float32)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sadgs_ns.cli.division import is_divided
 from sadgs_ns.cli.sadgs_options import Sadgs, adapt_remedy
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import check_findings
@@ -24,6 +25,7 @@ class GivenCameras:
 
     file: Path
     capture: Path  # The folder of the capture
+    is_divided: bool  # Whether something else than `--measure` says which views are held out
 
     def describe(self) -> str:
         """Return a text that is another one if the file is another one."""
@@ -51,6 +53,7 @@ def find_given_cameras(options: Sadgs, train_options: Sequence[str]) -> GivenCam
             parser in train_options for parser in _PARSERS
         ):  # Training checks what a parser reads that is named.
             check_findings(check_data(options.source), options.source)
+        divided = is_divided(file, options.source, options.measure, train_options)
     except InputError as error:
         problem = adapt_remedy(str(error).rstrip("."), train_options)
         raise InputError(f"{problem}; or find new cameras with --cameras new.") from None
@@ -60,4 +63,4 @@ def find_given_cameras(options: Sadgs, train_options: Sequence[str]) -> GivenCam
     capture = options.source
     if not capture.is_dir():
         capture = capture.parent
-    return GivenCameras(file, capture)
+    return GivenCameras(file, capture, divided)

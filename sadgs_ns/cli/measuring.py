@@ -1,90 +1,109 @@
-"""What `sadgs --measure` measures: held-out views as the run draws them, and as viewers draw the file."""
+"""What `sadgs --measure` measures: held-out views as the run draws them, and as viewers draw its file."""
 
 from __future__ import annotations
 
-import dataclasses
+import os
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from sadgs_ns.cli.inspection import load_run
-from sadgs_ns.errors import InputError
-from sadgs_ns.events import progress
-from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run.deferred_imports import import_nerfstudio
+
+import_nerfstudio()  # It precedes what imports nerfstudio, and takes half the time.
+
+from sadgs_ns.cli.inspection import load_run  # noqa: E402
+from sadgs_ns.cli.splat_file import draw, read_splat  # noqa: E402
+from sadgs_ns.errors import InputError  # noqa: E402
+from sadgs_ns.events import progress  # noqa: E402
+from sadgs_ns.training.pipeline import SadgsPipeline  # noqa: E402
 
 STAGE = "views"
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
 
+Measures = dict[str, float]
+"""`psnr` in dB and `ssim` of a view, and `lpips` if its weights could be loaded."""
+
 
 @torch.no_grad()
-def measure(run: Path, data: Path) -> str:
-    """Measure a run on its held-out views, and return a sentence. Raise InputError if it holds out none.
+def measure(run: Path, data: Path, file: Path) -> list[str]:
+    """Measure a run and its file on the held-out views as `ns-eval` does, and return sentences for the user.
 
-    Viewers have no near plane and draw what lies far off the axis, so the file is drawn without the run's limits.
+    One view is decoded and drawn at a time.
 
     Args:
         run: The run's folder.
         data: The capture, which may have been moved since.
+        file: A PLY of the run's Gaussians, in the frame of training.
+
+    Raises:
+        InputError: If the run holds out no view, or run, capture or file cannot be read.
     """
     pipeline, _ = load_run(run, data=data)
-    names = [path.name for path in pipeline.datamanager.eval_dataset.image_filenames]
+    names = _names_of_views(pipeline)
     if not names:
-        raise InputError("the run holds out no photo, so that there is nothing to measure: begin another --output.")
+        raise InputError("the run holds out no view, so that there is nothing to measure: begin another --output.")
     model = pipeline.model
-    of_run = _measure_views(pipeline, 0)
-    plan = model.plan
-    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE, max_off_axis=0.0)
-    of_file = _measure_views(pipeline, len(names))
-    model.plan = plan
-    return describe(names, of_run, of_file)
-
-
-def _measure_views(pipeline: SadgsPipeline, done: int) -> list[dict[str, Any]]:
-    """Return the measures of each held-out view, as the model draws it by its plan.
-
-    `done` is how many views were measured before.
-    """
-    model = pipeline.model
+    splat = read_splat(file, model.device)
+    pipeline.datamanager.config.cache_images = "compressed"  # type: ignore[assignment]
     views = pipeline.datamanager.fixed_indices_eval_dataloader
-    measures = []
+    of_run = []
+    of_file = []
     for index in range(len(views)):
-        progress(STAGE, done + index, 2 * len(views))
+        progress(STAGE, index, len(views))
         camera, batch = views[index]
         outputs = model.get_outputs_for_camera(camera)
-        drawn = {"rgb": outputs["rgb"], "background": outputs["background"]}
-        measured, _ = model.get_image_metrics_and_images(drawn, batch)
-        measures.append(measured)
+        of_run.append(_measure_view(pipeline, outputs["rgb"], batch))
+        drawn = draw(splat, model.pinhole(camera), model.background, model.config.backend)
+        of_file.append(_measure_view(pipeline, drawn[0], batch))
+    return describe(names, of_run, of_file, file.name)
+
+
+def _names_of_views(pipeline: SadgsPipeline) -> list[str]:
+    """Return the names of the held-out views, from the folder that all images have in common."""
+    manager = pipeline.datamanager
+    held_out = manager.eval_dataset.image_filenames
+    folders = [os.path.dirname(os.path.abspath(path)) for path in (*manager.train_dataset.image_filenames, *held_out)]
+    common = os.path.commonpath(folders)
+    return [os.path.relpath(path, common) for path in held_out]
+
+
+def _measure_view(pipeline: SadgsPipeline, drawn: Tensor, batch: dict[str, Any]) -> Measures:
+    """Compare a drawn view, [H, W, 3] in [0, 1], with its photo."""
+    model = pipeline.model
+    outputs = {"rgb": drawn, "background": model.background.expand(drawn.shape)}
+    measures, _ = model.get_image_metrics_and_images(outputs, batch)
     return measures
 
 
-def describe(names: Sequence[str], of_run: Sequence[dict[str, float]], of_file: Sequence[dict[str, float]]) -> str:
-    """Return a sentence on the means over held-out views of run and file, and the worst view of the file.
+def describe(names: Sequence[str], of_run: Sequence[Measures], of_file: Sequence[Measures], file: str) -> list[str]:
+    """Return sentences on the means over held-out views of run and file, and on the file's view of least PSNR.
 
     Args:
         names: The names of the V views.
-        of_run: `psnr` in dB, `ssim` and perhaps `lpips` of each view, as the run draws it. V of them
-        of_file: The same as viewers draw the file. V of them
+        of_run: The measures of each view as the run draws it. [V]
+        of_file: The same as viewers draw the file. [V]
+        file: The file's name.
     """
-    worst = min(range(len(names)), key=lambda index: of_file[index]["psnr"])
-    count = f"{len(names)} photos"
+    sentences = [f"run: {_means(of_run)}", f"{file}: {_means(of_file)}"]
+    if "lpips" not in of_run[0]:
+        sentences.append("LPIPS is left out, because its AlexNet weights could not be loaded")
+    psnr, worst = min((measures["psnr"], name) for name, measures in zip(names, of_file, strict=True))
     if len(names) == 1:
-        count = "1 photo"
-    worst_psnr = of_file[worst]["psnr"]
-    return (
-        f"{count} held out: run {_means(of_run)}; file {_means(of_file)}; worst in the file {names[worst]}, "
-        f"PSNR {worst_psnr:.2f}"
-    )
+        sentences.append(f"1 view was held out: {worst}")
+    else:
+        sentences.append(f"{len(names)} views were held out; worst in {file} is {worst}, PSNR {psnr:.2f}")
+    return sentences
 
 
-def _means(measures: Sequence[dict[str, float]]) -> str:
-    """Return the means of the measures that all views have."""
+def _means(measures: Sequence[Measures]) -> str:
+    """Return the means of those measures that the views have."""
     parts = []
     for name, digits in _DIGITS.items():
-        values = [measured[name] for measured in measures if name in measured]
-        if len(values) == len(measures):
-            parts.append(f"{name.upper()} {statistics.fmean(values):.{digits}f}")
+        if name in measures[0]:
+            mean = statistics.fmean(of_view[name] for of_view in measures)
+            parts.append(f"{name.upper()} {mean:.{digits}f}")
     return ", ".join(parts)

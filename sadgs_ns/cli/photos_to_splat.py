@@ -51,7 +51,7 @@ class PhotosToSplat:
         self.source = options.source
         self.folder = options.output or _default_folder(options.source)
         self.results = SadgsFolder(self.folder)
-        self.formats = choose_formats(options.formats, console)
+        self.formats = choose_formats(options.formats, options.measure, console)
         self.given = find_given_cameras(options, train_options)
         self.timeline = Timeline()
         check_options(options, train_options)
@@ -75,15 +75,18 @@ class PhotosToSplat:
 
     def _read_settings(self) -> None:
         cameras = "new"
+        measure: bool | None = self.options.measure
         if self.given is not None:
             cameras = self.given.describe()
+            if self.given.is_divided:
+                measure = None
         chosen = Settings(
             source=os.path.realpath(self.source),
             cameras=cameras,
             max_size=self.options.max_size,
             effort=self.options.effort,
             train_options=list(self.train_options),
-            measure=self.options.measure,
+            measure=measure,
         )
         self.results.read_settings(chosen, self.given)
 

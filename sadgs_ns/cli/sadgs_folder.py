@@ -33,14 +33,14 @@ class Settings:
     max_size: int | None = None
     effort: float | None = None
     train_options: list[str] | None = None
-    measure: bool | None = None  # None if the folder was begun by a version that always held out one photo in ten
+    measure: bool | None = None  # None if a given split, ns-train or an earlier version divides the views
 
     # How far the work is
     run: str = "run"  # The name of the present run's folder
     views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
     files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
     trained: str | None = None  # The sentence of a finished training
-    measured: str | None = None  # The sentence on how well run and file show the photos that were held out
+    measured: list[str] | None = None  # The sentences on how well run and file show the held-out views
     few: str | None = None  # The sentence on the registered photos, if they are few or their cameras are wrong
 
     @classmethod
@@ -100,8 +100,9 @@ class SadgsFolder:
             self.settings = chosen
             return
         self.settings = begun
-        if begun.measure is None and begun.views is not None:
-            chosen = replace(chosen, measure=None)  # Its views stay divided as they are.
+        has_run = begun.views is not None or self.checkpoint() is not None
+        if begun.measure is None and has_run:  # An earlier version began it: its views stay divided as they are.
+            chosen = replace(chosen, measure=None)
         differences = self._differences(chosen)
         if given is not None and self.checkpoint():
             differences += given.changed_images(begun.files)
@@ -116,9 +117,7 @@ class SadgsFolder:
         if self.has_scene():
             decided.append("max_size")
         if self.checkpoint():
-            decided += ["effort", "train_options"]
-            if self.settings.cameras == "new":  # Others are divided as their capture or ns-train says.
-                decided.append("measure")
+            decided += ["effort", "train_options", "measure"]
         differences = []
         for name in decided:
             before = getattr(self.settings, name)

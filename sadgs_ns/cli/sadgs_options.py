@@ -47,16 +47,17 @@ class Sadgs:
     anyway: bool = False
     """Continue even if fewer than half of the photos registered, or their cameras are wrong."""
     measure: bool = False
-    """Hold every eighth photo out of training, and print in the end how well run and file show these."""
+    """Hold every eighth photo out of training, and print in the end how well the run and splat.ply show these."""
     profile: bool = False
     """Also print where the time went as a table."""
 
 
-def choose_formats(requested: str | None, console: Console) -> list[str]:
+def choose_formats(requested: str | None, measure: bool, console: Console) -> list[str]:
     """Return the formats to export, with the page as the last one.
 
     Without a request they are a page and a PLY, or the PLY alone if there is no Node.js, which the console then says.
-    Raise InputError for an unknown format, a page without Node.js, or a mesh without open3d.
+    A PLY is among them if the file shall be measured. Raise InputError for an unknown format, a page without Node.js,
+    or a mesh without open3d.
     """
     has_node = shutil.which("npx") is not None
     if requested is None:
@@ -72,6 +73,8 @@ def choose_formats(requested: str | None, console: Console) -> list[str]:
         raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
     if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
+    if measure and "ply" not in formats:
+        formats.append("ply")
     return sorted(formats, key=lambda name: name == "html")
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sadgs_ns.cli.added_photos import choose_run
+from sadgs_ns.cli.division import parser_options
 from sadgs_ns.cli.export import Export
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.cli.sadgs_options import FORMAT_NAMES, adapt_remedy
@@ -139,7 +140,11 @@ def _train_command(work: PhotosToSplat, is_resumed: bool) -> list[str]:
     command += ["--steps-per-eval-image", "0", "--pipeline.effort", f"{work.options.effort:g}"]
     if is_resumed:
         command += ["--load-dir", str(run.absolute())]
-    return [*command, *work.train_options]
+    command += work.train_options
+    measures = work.results.settings.measure
+    if work.given is not None and measures is not None:
+        command += parser_options(measures, work.train_options)
+    return command
 
 
 class _TrainingProgress:
@@ -220,20 +225,24 @@ class _ExportProgress:
 
 
 def measure(work: PhotosToSplat, line: StatusLine) -> str:
-    """Measure how well run and file show the photos that were held out, unless that was done before."""
+    """Measure how well the run and its PLY show the views that were held out, unless that was done before."""
     settings = work.results.settings
     if settings.measured:
-        return f"{settings.measured}; done before"
-    line.update("starting")
-    worker = work.worker("measures", _MEASURING)
+        suffix = "; done before"
+    else:
+        suffix = ""
+        line.update("starting")
 
-    def on_event(event: str, **fields: Any) -> None:
-        if event == "progress":
-            line.update(f"{fields['stage']} {fields['done']} of {fields['total']}")
-        elif event == "warning":
-            line.print(fields["sentence"])
+        def on_event(event: str, **fields: Any) -> None:
+            if event == "progress":  # Training has printed the warnings, and the log has them again.
+                line.update(f"{fields['stage']} {fields['done']} of {fields['total']}")
 
-    settings.measured = work.call(worker, line, on_event, [], work.results.run, work.data)
-    work.results.write_settings()
+        worker = work.worker("measures", _MEASURING)
+        run = work.results.run
+        settings.measured = work.call(worker, line, on_event, [], run, work.data, work.results.splat("ply"))
+        work.results.write_settings()
     assert settings.measured is not None
-    return settings.measured
+    *others, last = settings.measured
+    for sentence in others:
+        line.finish(sentence)
+    return f"{last}{suffix}"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import IO
 
 import numpy as np
 
-from sadgs_ns.formats.gaussians import ROWS, Context, Gaussians
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.formats.gaussians import ROWS, Array, Context, Gaussians, of_parameters
 
 
 def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
@@ -33,3 +35,31 @@ def write(file: IO[bytes], gaussians: Gaussians, _: Context) -> None:
         columns = [part.means, normals, part.features_dc, rest, opacities, part.scales, part.quats]
         rows = np.concatenate(columns, axis=1)
         file.write(rows.astype("<f4").tobytes())
+
+
+def read(path: Path) -> Gaussians:
+    """Read the Gaussians of such a file, also of another program; raise InputError if it holds none."""
+    from plyfile import PlyData
+
+    try:
+        vertices = PlyData.read(str(path))["vertex"].data
+
+        def columns(*names: str) -> Array:
+            return np.stack([vertices[name] for name in names], axis=1).astype(np.float32)
+
+        num_rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
+        rest = np.zeros((len(vertices), 0, 3), np.float32)
+        if num_rest:
+            by_color = columns(*(f"f_rest_{index}" for index in range(num_rest))).reshape(len(vertices), 3, -1)
+            rest = by_color.transpose(0, 2, 1)  # The file has colour before band.
+        params = {
+            "means": columns("x", "y", "z"),
+            "scales": columns("scale_0", "scale_1", "scale_2"),
+            "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            "opacities": columns("opacity"),
+            "features_dc": columns("f_dc_0", "f_dc_1", "f_dc_2"),
+            "features_rest": rest,
+        }
+        return of_parameters(params)
+    except Exception as error:  # A damaged header may lead plyfile's parser to anything.
+        raise InputError(f"{path} cannot be read as a PLY of Gaussians ({reason(error)}): write it again.") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
 
 import numpy as np
@@ -10,6 +11,8 @@ from PIL import Image
 VIEWS = 8
 """Views of a panorama: four above the horizon, and four below it that look between those. A view of 90° × 90° has a
 quarter of the panorama's width, so nearly as many pixels as the panorama has there."""
+_VIEW_NAME = re.compile(r"(.+\.[a-z]\w{2,3})/[0-7]\.(jpg|png)", re.IGNORECASE)
+"""Name of a panorama's view, which lies in a folder that is called as the photo, as `Photo.views` names it."""
 _PITCH = 22.5
 """Degrees above and below the horizon. The views show latitudes up to 60°, and none over 68°, where a tripod is."""
 
@@ -23,6 +26,14 @@ def rotations() -> np.ndarray:
 
     angles = np.radians([(90 * i, _PITCH) for i in range(4)] + [(90 * i + 45, -_PITCH) for i in range(4)])
     return np.stack([turn(0, yaw) @ turn(pitch, 0) for yaw, pitch in angles])
+
+
+def photo_of(view: str) -> str:
+    """Return the name that all views of a panorama share, given that of one; the name of another image is its own."""
+    found = _VIEW_NAME.fullmatch(view)
+    if found is None:
+        return view
+    return found[1]
 
 
 def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:

@@ -176,13 +176,9 @@ def _describe_photos(scene: Scene, photos: Sequence[Photo], say: Say) -> None:
         say("added", f"{added}.", photos=added)
     panoramas = sum(photo.is_panorama for photo in photos)
     if panoramas:
-        if len(photos) > 4:
-            held_out = "all those of a panorama"
-        else:
-            held_out = "single ones"
         found = f"{panoramas} of the {len(photos)} photos are panoramas"
         views = f"each is cut into {VIEWS} views of 90°, which leave out 30° about the zenith and the nadir"
-        say("panoramas", f"{found}: {views}; {held_out} are held out.")
+        say("panoramas", f"{found}: {views}.")
     largest_values = [photo.largest_value for photo in photos if photo.bit_depth and photo.largest_value is not None]
     if largest_values and scene.settings.bit_depth:
         say("aside", bit_depth.sentence_on_depth(scene.settings.bit_depth, largest_values))

@@ -269,8 +269,8 @@ class SadgsPipeline(VanillaPipeline):
         views = len(self.datamanager.eval_dataset)
         if views == 0:
             raise InputError(
-                "The run holds out no view, so that there is nothing to measure: train with one of the parser's "
-                "--eval-mode that holds out some, or with `sadgs … --measure`."
+                "The run holds out no view, so that there is nothing to measure: train anew with `sadgs … --measure`, "
+                "or with an --eval-mode that holds out some, unless transforms.json lists the images of each split."
             )
         return super().get_average_eval_image_metrics(step, output_path, get_std and views > 1)
 

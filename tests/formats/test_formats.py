@@ -30,7 +30,7 @@ from helpers.random_gaussians import random_gaussians
 from sadgs_ns import formats
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats import glb, html, packing, sog
+from sadgs_ns.formats import glb, html, packing, ply, sog
 from sadgs_ns.formats.gaussians import Context, Gaussians, Start, of_parameters
 
 START = Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
@@ -126,6 +126,26 @@ def test_a_foreign_reader_finds_the_gaussians_within_the_format_s_error(suffix: 
     assert found.features_rest.shape == written.features_rest.shape
     for name, error in errors(written, found).items():
         assert error <= BOUNDS[suffix][name], (name, error)
+
+
+@pytest.mark.parametrize("bands", [0, 3, 8, 15])
+def test_our_reader_finds_the_gaussians_of_a_ply(bands: int, tmp_path: Path):
+    written = random_gaussians(20, bands)
+    formats.write(tmp_path / "splat.ply", written)
+    found = ply.read(tmp_path / "splat.ply")
+    assert vars(written).keys() == vars(found).keys()
+    for name, values in vars(written).items():
+        expected = vars(found)[name]
+        assert (values.shape, values.dtype) == (expected.shape, expected.dtype)
+        np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6 if name == "quats" else 0)
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", None])
+def test_a_ply_that_cannot_be_read_is_named(content: bytes | None, tmp_path: Path):
+    if content is not None:
+        (tmp_path / "splat.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"/splat\.ply cannot be read as a PLY of Gaussians \(.+\): write it again\."):
+        ply.read(tmp_path / "splat.ply")
 
 
 @pytest.mark.parametrize("suffix", READ_BACK)

@@ -76,20 +76,23 @@ def cpu_notice(threads: int) -> str:
     )
 
 
-def next_commands(config: Path, gaussians: int) -> str:
-    """Return the commands for a finished run, from the path of its `config.yml` and its number of Gaussians."""
+def next_commands(config: Path, gaussians: int, held_out: int) -> str:
+    """Return the commands for a finished run, given its `config.yml`, its Gaussians and its held-out views."""
     file = shlex.quote(str(config))
     metrics = shlex.quote(str(config.with_name("eval.json")))
     splat = shlex.quote(str(config.with_name("splat.ply")))
-    return (
-        f"What can be done with these {gaussians:,} Gaussians:\n"
-        f"  ns-viewer --load-config {file}\n"
-        "    shows the Gaussians in a browser\n"
-        f"  ns-eval --load-config {file} --output-path {metrics}\n"
-        "    compares held-out views with their photos\n"
-        f"  sadgs-export {file} --output {splat}\n"
-        "    writes the Gaussians for other programs"
-    )
+    lines = [
+        f"What can be done with these {gaussians:,} Gaussians:",
+        f"  ns-viewer --load-config {file}",
+        "    shows the Gaussians in a browser",
+    ]
+    if held_out:
+        lines += [
+            f"  ns-eval --load-config {file} --output-path {metrics}",
+            "    compares held-out views with their photos",
+        ]
+    lines += [f"  sadgs-export {file} --output {splat}", "    writes the Gaussians for other programs"]
+    return "\n".join(lines)
 
 
 class ProgressTable(LocalWriter):

@@ -125,7 +125,8 @@ class SadgsTrainer(Trainer):
         if self.pipeline.diverged:
             return
         gaussians = self.pipeline.model.num_gaussians
-        note(next_commands(self.base_dir / "config.yml", gaussians))
+        held_out = len(self.pipeline.datamanager.eval_dataset)
+        note(next_commands(self.base_dir / "config.yml", gaussians, held_out))
         events.report("training ends", gaussians=gaussians)
 
     def _load_checkpoint(self) -> None:

@@ -1,0 +1,191 @@
+"""Which views `sadgs` trains on and which `--measure` holds out, of new and of given cameras."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from helpers.captures import write_capture
+from helpers.short_runs import blender_data
+from sadgs_ns.cli.added_photos import choose_run
+from sadgs_ns.cli.division import divide
+from sadgs_ns.cli.photos_to_splat import PhotosToSplat
+from sadgs_ns.cli.sadgs_folder import SadgsFolder, Settings
+from sadgs_ns.cli.sadgs_options import Sadgs
+from sadgs_ns.cli.sadgs_stages import _train_command
+from sadgs_ns.data.own_parsers import OWN
+from sadgs_ns.errors import InputError
+from sadgs_ns.training.run.start import read_options
+
+VIEWS = [f"images/{i:02d}.png" for i in range(20)]
+PANORAMAS = [f"images/{i:02d}.jpg/{view}.jpg" for i in range(10) for view in range(8)]
+
+
+def test_all_views_are_trained_on_unless_they_shall_be_measured():
+    divided = divide(VIEWS, measure=False)
+    assert divided == {"train_filenames": VIEWS, "val_filenames": [], "test_filenames": []}
+    assert divide(VIEWS, False, VIEWS[:10], VIEWS[:2]) == divided, "also if some were held out before"
+
+
+def test_every_eighth_view_is_held_out_to_be_measured():
+    divided = divide(VIEWS, measure=True)
+    assert divided["val_filenames"] == divided["test_filenames"] == [VIEWS[0], VIEWS[8], VIEWS[16]]
+    assert divided["train_filenames"] == [name for name in VIEWS if name not in divided["test_filenames"]]
+
+
+def test_held_out_views_stay_so_when_photos_are_added():
+    before = divide(VIEWS[:10], measure=True)["test_filenames"]
+    after = divide(VIEWS, True, VIEWS[:10], before)
+    assert after["test_filenames"] == [VIEWS[0], VIEWS[8], VIEWS[17]]
+    assert len(after["train_filenames"]) == 17
+    assert divide(VIEWS[:11], True, VIEWS[:10], before)["test_filenames"] == before
+    between = [*VIEWS[:3], "images/02-b.png", *VIEWS[3:10]]
+    assert divide(between, True, VIEWS[:10], before)["test_filenames"] == before
+
+
+@pytest.mark.hard_case("`sadgs PANORAMAS --measure`", "every eighth panorama is held out with all its views")
+def test_panoramas_are_held_out_whole():
+    views = ["images/a.png", *PANORAMAS]
+    divided = divide(views, measure=True)
+    assert divided["test_filenames"] == ["images/a.png", *PANORAMAS[7 * 8 : 8 * 8]]
+    assert len(divided["train_filenames"]) == len(views) - 9
+    later = [name.replace("images/", "images/later/") for name in PANORAMAS]
+    grown = divide([*views, *later], True, views, [*divided["test_filenames"], later[0]])
+    assert grown["test_filenames"] == [*divided["test_filenames"], *later[7 * 8 : 8 * 8]]
+    few = divide(PANORAMAS[: 4 * 8], measure=True)
+    assert few["test_filenames"] == PANORAMAS[: 4 * 8 : 8], "of few panoramas single views are"
+    in_folder = [f"images/room.1/{i}.jpg" for i in range(8)]
+    assert divide(in_folder, measure=True)["test_filenames"] == in_folder[:1], "this folder is no panorama"
+
+
+def write_scene(folder: SadgsFolder, views: Sequence[str]) -> None:
+    folder.scene.mkdir(parents=True, exist_ok=True)
+    content = json.dumps({"frames": [{"file_path": name} for name in views]})
+    (folder.scene / "transforms.json").write_text(content)
+
+
+def test_until_something_is_trained_the_division_may_be_another_one(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    write_scene(folder, VIEWS)
+    for measure, held_out in ((False, 0), (True, 3), (False, 0)):
+        folder.settings.measure = measure
+        choose_run(folder, [])
+        described = json.loads((folder.scene / "transforms.json").read_text())
+        assert len(described["test_filenames"]) == held_out
+        assert len(described["train_filenames"]) == 20 - held_out
+
+
+def test_options_of_ns_train_that_divide_the_views_do_it(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    write_scene(folder, VIEWS)
+    folder.settings.measure = True
+    choose_run(folder, ["nerfstudio-data", "--train-split-fraction", "0.5"])
+    assert json.loads((folder.scene / "transforms.json").read_text()).keys() == {"frames"}
+
+
+def train_command(source: Path, output: Path, measure: bool, options: Sequence[str] = ()) -> list[str]:
+    """The command that `sadgs` would train with on given cameras."""
+    work = PhotosToSplat(Sadgs(source, output, formats="ply", measure=measure), list(options), Console(quiet=True))
+    return _train_command(work, is_resumed=False)
+
+
+@pytest.fixture
+def given(scene: Path, tmp_path: Path) -> Path:
+    """A capture with a `transforms.json` that has no lists of images."""
+    capture = write_capture("transforms.json", tmp_path / "capture", scene)
+    shutil.rmtree(capture.mask.parent)
+    described = json.loads(capture.cameras.read_text())
+    for frame in described["frames"]:
+        del frame["mask_path"]
+    capture.cameras.write_text(json.dumps(described))
+    return capture.folder
+
+
+@pytest.mark.hard_case(
+    "`sadgs FOLDER` with a `transforms.json` without lists of images",
+    "all images are trained on; `--measure` holds every eighth out; the file stays as it is",
+)
+@pytest.mark.parametrize("options", [[], ["nerfstudio-data", "--downscale-factor", "1"]])
+def test_given_cameras_without_lists_are_divided_as_others(given: Path, tmp_path: Path, options: list[str]):
+    content = (given / "transforms.json").read_bytes()
+    count = len(json.loads(content)["frames"])
+    for measure, held_out in ((False, []), (True, [*range(0, count, 8)])):
+        command = train_command(given, tmp_path / "out", measure, options)
+        manager: Any = read_options(command[2:]).pipeline.datamanager
+        config = manager.dataparser
+        config.data = given
+        config.downscale_factor = 1  # Otherwise nerfstudio opens an image and leaves it open.
+        parser = OWN[config._target](config)
+        images = {split: parser.get_dataparser_outputs(split).image_filenames for split in ("train", "val", "test")}
+        every = sorted(images["train"] + images["test"])
+        assert len(every) == count and images["val"] == images["test"] == [every[i] for i in held_out]
+    assert (given / "transforms.json").read_bytes() == content
+
+
+@pytest.mark.parametrize("layout", ["sparse/0", "beside", "lists", "blender"])
+def test_a_division_that_is_given_stays(layout: str, scene: Path, given: Path, tmp_path: Path):
+    source = given
+    if layout == "lists":
+        described = json.loads((given / "transforms.json").read_text())
+        names = [frame["file_path"] for frame in described["frames"]]
+        described |= {"train_filenames": names[3:], "val_filenames": names[:3], "test_filenames": names[:3]}
+        (given / "transforms.json").write_text(json.dumps(described))
+    elif layout == "blender":
+        source = tmp_path / "blender"
+        blender_data(source, None)
+    else:
+        source = write_capture(layout, tmp_path / "model", scene).folder
+    for measure in (False, True):
+        command = train_command(source, tmp_path / "out", measure)
+        assert command[-2:] == ["--pipeline.effort", "1"]
+
+
+@pytest.mark.parametrize(
+    "options", [["nerfstudio-data", "--eval-mode", "all"], ["colmap"], ["instant-ngp-data", "--data", "x"]]
+)
+def test_options_that_divide_given_cameras_or_name_another_parser_stay(
+    given: Path, tmp_path: Path, options: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("sadgs_ns.cli.photos_to_splat.check_options", lambda *others: None)
+    assert train_command(given, tmp_path / "out", True, options)[-len(options) :] == options
+
+
+@pytest.mark.hard_case(
+    "`sadgs FOLDER --measure` with a division that holds no image out", "refused before anything is done"
+)
+def test_given_lists_that_hold_nothing_out_cannot_be_measured(given: Path, tmp_path: Path):
+    described = json.loads((given / "transforms.json").read_text())
+    described["train_filenames"] = [frame["file_path"] for frame in described["frames"]]
+    described |= {"val_filenames": [], "test_filenames": []}
+    (given / "transforms.json").write_text(json.dumps(described))
+    with pytest.raises(InputError, match=r"the lists in \S+/transforms\.json hold out none: name some as test_file"):
+        train_command(given, tmp_path / "out", True)
+    assert train_command(given, tmp_path / "out", False)[-2:] == ["--pipeline.effort", "1"]
+    blender = tmp_path / "blender"
+    blender_data(blender, None)
+    (blender / "transforms_test.json").unlink()
+    with pytest.raises(InputError, match=r"held out, and \S+/transforms_test\.json does not exist: leave it out; or"):
+        train_command(blender, tmp_path / "out", True)
+
+
+@pytest.mark.hard_case(
+    "a folder that an earlier version of `sadgs` began on given cameras", "its views stay divided as they are"
+)
+def test_given_cameras_on_which_an_earlier_version_trained_stay_divided(given: Path, tmp_path: Path):
+    out = tmp_path / "out"
+    work = PhotosToSplat(Sadgs(given, out, formats="ply"), [], Console(quiet=True))
+    assert work.given is not None
+    settings = Settings(str(given.resolve()), work.given.describe(), 1600, 1.0, [], files=work.given.stamp_images())
+    checkpoints = out / "training" / "sadgs" / "run" / "nerfstudio_models"
+    checkpoints.mkdir(parents=True)
+    settings.write(out / "settings.json")
+    assert train_command(given, out, False)[-1] == "1", "nothing is trained yet"
+    (checkpoints / "step-000000007.ckpt").touch()
+    for measure in (False, True):
+        assert train_command(given, out, measure)[-2:] == ["--pipeline.effort", "1"]
