@@ -87,7 +87,8 @@ def print_uncaught_errors_as_sentences() -> None:
     show = sys.excepthook
 
     def show_sentence(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if (sentence := sentence_of(error)) is None:
+        sentence = sentence_of(error)
+        if sentence is None:
             show(kind, error, traceback)
         else:
             print(f"error: {sentence}", file=sys.stderr)

@@ -13,7 +13,8 @@ FILE = "SADGS_EVENTS"  # Environment variable that names a file, where a listene
 
 def report(event: str, **fields: Any) -> None:
     """Report an event to the listener, if there is one; its fields are JSON or dataclasses."""
-    if path := os.environ.get(FILE):
+    path = os.environ.get(FILE)
+    if path:
         line = json.dumps({"event": event, **fields}, default=dataclasses.asdict) + "\n"
         # The listener has made the file; one that it removed stays away.
         with suppress(OSError), open(os.open(path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0) as file:

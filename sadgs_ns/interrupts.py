@@ -41,7 +41,8 @@ class Interrupts:
         self.received = None
         if threading.current_thread() is threading.main_thread():
             default = (signal.SIG_DFL, signal.default_int_handler)
-            self._previous = {s: old for s in SIGNALS if (old := signal.getsignal(s)) in default}
+            handlers = {number: signal.getsignal(number) for number in SIGNALS}
+            self._previous = {number: old for number, old in handlers.items() if old in default}
             for number in self._previous:
                 signal.signal(number, self._handle)
         return self

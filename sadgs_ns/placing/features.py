@@ -63,7 +63,8 @@ def rename_images(database: Path, characters: dict[int, int]) -> None:
     """Replace characters in the names of the images in COLMAP's database."""
     with pycolmap.Database.open(database) as opened, pycolmap.DatabaseTransaction(opened):
         for image in opened.read_all_images():
-            if (name := image.name.translate(characters)) != image.name:
+            name = image.name.translate(characters)
+            if name != image.name:
                 image.name = name
                 opened.update_image(image)
 
@@ -75,7 +76,8 @@ def _add_images(
     with pycolmap.Database.open(database) as opened:
         known = {image.name: image.camera_id for image in opened.read_all_images()}
     for group in groups:
-        if missing := [name for name in group if name in lot and name not in known]:
+        missing = [name for name in group if name in lot and name not in known]
+        if missing:
             reader = pycolmap.ImageReaderOptions(camera_model="OPENCV")
             # An earlier lot or run has made the camera.
             reader.existing_camera_id = next((known[name] for name in group if name in known), -1)
@@ -128,9 +130,11 @@ def sift(photo: Path, mask: Path | None = None) -> tuple[np.ndarray, np.ndarray]
     values = None
     if image is not None:
         height, width = image.shape
-        if (shrink := min(1.0, MAX_SIDE / max(width, height))) < 1:
-            size = max(1, round(shrink * width)), max(1, round(shrink * height))
-            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        shrink = min(1.0, MAX_SIDE / max(width, height))
+        if shrink < 1:
+            smaller_width = max(1, round(shrink * width))
+            smaller_height = max(1, round(shrink * height))
+            image = cv2.resize(image, (smaller_width, smaller_height), interpolation=cv2.INTER_AREA)
         finder = cv2.SIFT.create(MOST_FEATURES, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
         searched = cv2.imread(str(mask), cv2.IMREAD_GRAYSCALE) if mask and mask.exists() else None
         if searched is not None:

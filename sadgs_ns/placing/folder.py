@@ -47,11 +47,14 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
         raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
     photos, masks, others = look_into(source, out)
     if len(photos) < 3:
-        if videos := find_videos(source):
-            unused = [f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3."] if photos else []
+        videos = find_videos(source)
+        if videos:
+            unused = []
+            if photos:
+                unused.append(f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3.")
             return videos, True, {}, [*unused, *others]
-        told = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
-        raise InputError(" ".join([told, *others]))
+        problem = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        raise InputError(" ".join([problem, *others]))
     for name in photos:
         if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
@@ -70,7 +73,8 @@ def _visible_files(folder: Path) -> list[str]:
     """
     paths = list[Path]()
     unread = list[OSError]()
-    seen = {top := Path(os.path.realpath(folder)), *top.parents}
+    top = Path(os.path.realpath(folder))
+    seen = {top, *top.parents}
     for parent, folders, files in os.walk(folder, onerror=unread.append, followlinks=True):
         paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
         real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
@@ -120,7 +124,10 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     stems = defaultdict(list)
     masks = {}
     for name in files:
-        if scenes.isdisjoint((folder / name).parents) and (kind := _kind(folder / name)):
+        kind = ""
+        if scenes.isdisjoint((folder / name).parents):
+            kind = _kind(folder / name)
+        if kind:
             if kind == "photos" and name not in known:
                 others = {"thumbnails or trash": _SERVICE, "depth or other maps": _MAP, "masks": _MASK}
                 kind = next((other for other, names in others.items() if names.fullmatch(name)), kind)
@@ -200,7 +207,10 @@ def _copies(folder: Path, photos: Sequence[str], known: Collection[str]) -> list
     groups = defaultdict(list)
     copies = []
     for name in sorted(photos, key=len):
-        if (folder / name).is_file() and (size := (folder / name).stat().st_size):
+        size = 0
+        if (folder / name).is_file():
+            size = (folder / name).stat().st_size
+        if size:
             groups[size].append(name)
             groups[_stem(name)].append(name)
     for names in (names for names in groups.values() if len(names) > 1):

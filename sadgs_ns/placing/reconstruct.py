@@ -123,7 +123,8 @@ def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
     names = in_order([frame["file_path"] for frame in described["frames"]])
     whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
     chosen = list(dict.fromkeys(whole.values()))[4::10]
-    if held_out := [name for name in names if whole[name] in chosen]:
+    held_out = [name for name in names if whole[name] in chosen]
+    if held_out:
         described["train_filenames"] = [name for name in names if whole[name] not in chosen]
         described |= {"val_filenames": held_out, "test_filenames": held_out}
         file.write_text(json.dumps(described, indent=4))
@@ -395,9 +396,12 @@ def summarize(
             for identity in pycolmap.pair_id_to_image_pair(pair):
                 matches[identity] = max(matches[identity], count)
         for name in set(names) - registered:
-            if (identity := identities.get(name)) is None:
+            identity = identities.get(name)
+            if identity is None:
                 left_out[name] = "could not be read"
-            elif (count := opened.num_keypoints_for_image(identity)) < FEW_FEATURES:
+                continue
+            count = opened.num_keypoints_for_image(identity)
+            if count < FEW_FEATURES:
                 left_out[name] = f"only {count} features: blurred, dark or without texture"
             elif matches[identity] < 30:
                 left_out[name] = "matches no other photo: too little overlap"
