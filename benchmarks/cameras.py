@@ -21,13 +21,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-from tyro.conf import Positional
-
 from benchmarks import results
 from benchmarks.camera_table import markdown, markdown_of_truths
-from benchmarks.chain import now, photos_of
-from benchmarks.side_by_side import environment_of, run_side_by_side, sigterm_exits
+from benchmarks.chain import now
+from benchmarks.photo_captures import PhotoCommand, load_protocol, photos_of
+from benchmarks.side_by_side import environment_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.placing.conversion import convert_photos
 from sadgs_ns.placing.photos import photos_by_camera, photos_by_camera_and_folder, read_photos
@@ -103,13 +101,7 @@ class Photos:
 
 def load(path: Path) -> Protocol:
     """Read a protocol. Raises ValueError, one sentence, if it is not as `Protocol` says."""
-    try:
-        return Protocol(**yaml.safe_load(path.read_text("utf8")))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); give the YAML file of captures.") from error
-    except (TypeError, yaml.YAMLError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path} must be YAML with captures and seeds: {reason}.") from error
+    return load_protocol(path, Protocol, "captures")
 
 
 def prepare(folder: Path, work: Path) -> Photos:
@@ -122,17 +114,9 @@ def prepare(folder: Path, work: Path) -> Photos:
 
 
 @dataclass
-class Command:
+class Command(PhotoCommand):
     """Measure how accurately cameras are placed, or what is left of it."""
 
-    protocol: Positional[Path]
-    """YAML file of captures and seeds"""
-    photos: Path
-    """folder that holds the captures' folders"""
-    output: Path
-    """JSON-lines file; rows already in it are not measured again"""
-    label: str
-    """name of these rows, such as a commit"""
     seeds: tuple[int, ...] = ()
     """seeds of COLMAP's random samples; the default is the protocol's"""
     only: tuple[str, ...] = ()
@@ -154,9 +138,7 @@ class Command:
             if name in protocol.truths:
                 jobs.append(Job(name, self.label, seeds, variants, truth=protocol.truths[name]))
             elif name in protocol.captures:
-                folder = (self.photos / protocol.captures[name]).resolve()
-                if not photos_of(folder):
-                    raise ValueError(f"{folder} holds no photos; check --photos.")
+                folder = self.folder_of(protocol.captures[name])
                 jobs.append(Job(name, self.label, seeds, variants, folder=str(folder)))
             else:
                 known = ", ".join([*protocol.captures, *protocol.truths])
@@ -173,12 +155,8 @@ class Command:
                 results.append(self.output, row)
                 print(line(row), flush=True)
 
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        with sigterm_exits():
-            try:
-                run_side_by_side(todo, _start, ended)
-            except KeyboardInterrupt:
-                return 130
+        if not self.run(todo, _start, ended):
+            return 130
         rows = results.read(self.output)
         for table in (markdown(rows), markdown_of_truths(rows)):
             if table:

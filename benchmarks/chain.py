@@ -24,15 +24,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-from tyro.conf import Positional
-
 from benchmarks import results
 from benchmarks.chain_table import markdown
-from benchmarks.side_by_side import environment_of, run_side_by_side, sigterm_exits
+from benchmarks.photo_captures import PhotoCommand, load_protocol, photos_of
+from benchmarks.side_by_side import environment_of
 
 INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
-SUFFIXES = {".jpg", ".jpeg", ".png"}
 LOADER = (
     "import sys; from importlib.metadata import entry_points; name = sys.argv[1]; sys.argv = sys.argv[1:]; "
     "(script,) = {s for s in entry_points(group='console_scripts') if s.name == name}; sys.exit(script.load()())"
@@ -69,19 +66,7 @@ class Chain:
 
 def load(path: Path) -> Protocol:
     """Read a protocol. Raises ValueError, one sentence, if it is not as `Protocol` says."""
-    try:
-        return Protocol(**yaml.safe_load(path.read_text("utf8")))
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); give the YAML file of a chain.") from error
-    except (TypeError, yaml.YAMLError) as error:
-        told = " ".join(str(error).split())
-        raise ValueError(f"{path} must be YAML with captures and seeds: {told}.") from error
-
-
-def photos_of(folder: Path) -> list[str]:
-    """Return the names of a folder's photos in the order that decides which are held out."""
-    paths = [path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
-    return sorted(path.relative_to(folder).as_posix() for path in paths)
+    return load_protocol(path, Protocol, "a chain")
 
 
 def held_out(names: Sequence[str]) -> list[str]:
@@ -179,17 +164,9 @@ def now() -> str:
 
 
 @dataclass
-class Command:
+class Command(PhotoCommand):
     """Measure the way from photos to the exported file, or what is left of it."""
 
-    protocol: Positional[Path]
-    """YAML file of captures and seeds"""
-    photos: Path
-    """folder that holds the captures' folders"""
-    output: Path
-    """JSON-lines file; chains already in it are skipped"""
-    label: str
-    """name of these rows, such as a commit"""
     site: Path | None = None
     """folder with another version of the package, whose commands run; the default is this checkout"""
     only: str = ""
@@ -201,15 +178,15 @@ class Command:
         """Return the chains that are asked for; raise ValueError if a capture is not there."""
         protocol = load(self.protocol)
         names = self.only.split(",") if self.only else list(protocol.captures)
+        folders = {}
         for name in names:
             if name not in protocol.captures:
                 raise ValueError(f"--only names {name!r}; the protocol has {', '.join(protocol.captures)}.")
-            if not photos_of(self.photos / protocol.captures[name]):
-                raise ValueError(f"{self.photos / protocol.captures[name]} holds no photos; check --photos.")
+            folders[name] = self.folder_of(protocol.captures[name])
         return [
             Chain(
                 name,
-                (self.photos / protocol.captures[name]).resolve(),
+                folders[name],
                 seed,
                 self.label,
                 protocol.max_size,
@@ -234,12 +211,8 @@ class Command:
             results.append(self.output, row)
             print(f"{chain.key}: {line(row)}", flush=True)
 
-        self.output.parent.mkdir(parents=True, exist_ok=True)
-        with sigterm_exits():
-            try:
-                run_side_by_side(todo, launch, ended, gpus)
-            except KeyboardInterrupt:
-                return 130
+        if not self.run(todo, launch, ended, gpus):
+            return 130
         rows = [row for row in results.read(self.output) if row["key"] in {chain.key for chain in chains}]
         print(markdown(results.read(self.output)))
         return int(any(row["status"] != "ok" for row in rows))

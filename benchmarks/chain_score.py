@@ -146,7 +146,7 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
 
 def main() -> None:
     """Write the score of a file."""
-    from benchmarks.chain import photos_of
+    from benchmarks.photo_captures import photos_of
     from benchmarks.run import software
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.chain_score", description=__doc__)
