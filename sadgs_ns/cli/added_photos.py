@@ -1,4 +1,4 @@
-"""Another run for photos that were added, in the frame of the earlier one and with the same held-out views."""
+"""The division of a scene's views, and another run in the same frame when photos were added."""
 
 from __future__ import annotations
 

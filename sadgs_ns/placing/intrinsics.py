@@ -1,10 +1,11 @@
 """The intrinsics of cameras while photos are placed: few parameters first, all of them in the end.
 
 COLMAP estimates all parameters of a camera from the first two photos on. Two photos can be explained by many values of
-the eight parameters of OPENCV, and photos that are placed after a wrong choice do not fit: of a church whose photos
-show one front, 2 to 4 of 29 registered in five of five placings on a GPU host. With one focal length and one
-coefficient of distortion 27 to 29 did, and placing takes two thirds to nine tenths of the time. A lens whose pixels are
-not square, or whose distortion is complicated, is known well enough by then that the other parameters are only refined.
+the eight parameters of OPENCV, and photos that are placed after a wrong choice do not fit: of the capture lund, 2 to 4
+of 29 photos registered in five of five placings on a GPU host. With one focal length and one coefficient of distortion
+24 to 29 did in eight of eight. On five other captures placing takes .9 to 1.3 times as long, and on mouse a quarter to
+three quarters. A lens whose pixels are not square, or whose distortion is complicated, is known well enough by then:
+the other parameters are only refined.
 """
 
 from __future__ import annotations
