@@ -18,7 +18,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
 import pycolmap
 
 from sadgs_ns.errors import InputError
@@ -344,10 +343,9 @@ class _Search:
         if candidate is None:
             return _Quality(False, False, 0)
         count = candidate.num_reg_images()
-        cameras = [image.camera for image in candidate.images.values()]
-        stretch = np.median([camera.focal_length_x / camera.focal_length_y for camera in cameras]) - 1
-        is_enough = bool(count >= _ENOUGH * len(self.names) and abs(stretch) < _MOST_STRETCH)
-        judgement = judge(measure(candidate))
+        measures = measure(candidate)
+        is_enough = count >= _ENOUGH * len(self.names) and measures.stretch < 1 + _MOST_STRETCH
+        judgement = judge(measures)
         return _Quality(not judgement.faults, is_enough and judgement.is_sound, count)
 
 
