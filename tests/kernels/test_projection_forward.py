@@ -1,4 +1,4 @@
-"""The forward projection against its torch twin in float64, in cases that cancel in float32, and on CUDA beside gsplat."""
+"""The forward projection against float64, also where float32 cancels, and on CUDA beside gsplat's."""
 
 from __future__ import annotations
 
@@ -71,9 +71,8 @@ def by_the_kernel(scene: Scene, width: int, height: int, near_plane: float = 0.0
 
 def by_the_twin(scene: Scene, dtype: torch.dtype, width: int, height: int) -> tuple[Tensor, ...]:
     """Project in torch."""
-    return gsplat_stub.project(
-        **{name: value.to(dtype) for name, value in scene.items()}, width=width, height=height
-    )  # fmt: skip
+    inputs: dict[str, Any] = {name: value.to(dtype) for name, value in scene.items()}
+    return gsplat_stub.project(**inputs, width=width, height=height)
 
 
 def relative_errors(conics: Tensor, true: Tensor) -> Tensor:
@@ -291,7 +290,7 @@ def test_no_gaussians_have_no_rows(per_axis_radii: bool, monkeypatch: Any):
 def test_it_is_as_close_to_float64_as_gsplat(num_views: int):
     scene = random_scene(num_views)
     true_radii, *true = by_the_twin(scene, torch.float64, WIDTH, HEIGHT)
-    inputs = {name: value.float().to(DEVICE) for name, value in scene.items()}
+    inputs: dict[str, Any] = {name: value.float().to(DEVICE) for name, value in scene.items()}
     gsplats = [value.cpu() for value in gsplat_compat.project(**inputs, width=WIDTH, height=HEIGHT)]
     ours = by_the_kernel(scene, WIDTH, HEIGHT)
     assert ours[0].shape == gsplats[0].shape and ours[0].dtype == gsplats[0].dtype
@@ -312,7 +311,7 @@ def test_it_is_as_close_to_float64_as_gsplat(num_views: int):
 def test_conics_of_hard_cases_are_closer_to_float64_than_gsplats():
     for name, scene in hard_scenes().items():
         *_, true = by_the_twin(scene, torch.float64, 1600, 1060)
-        inputs = {name: value.float().to(DEVICE) for name, value in scene.items()}
+        inputs: dict[str, Any] = {name: value.float().to(DEVICE) for name, value in scene.items()}
         radii, means2d, _, gsplats = (v.cpu() for v in gsplat_compat.project(**inputs, width=1600, height=1060))
         drawn = gsplat_compat.drawn(radii, means2d)
         gsplats_error = math.inf  # gsplat culls what has a determinant ≤ 0.
@@ -326,7 +325,7 @@ def test_conics_of_hard_cases_are_closer_to_float64_than_gsplats():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs need CUDA")
 def test_a_cuda_graph_replays_it():
     scene = random_scene(2)
-    inputs = {name: value.float().to(DEVICE) for name, value in scene.items()}
+    inputs: dict[str, Any] = {name: value.float().to(DEVICE) for name, value in scene.items()}
     expected = projection_forward.project_forward(**inputs, width=WIDTH, height=HEIGHT)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph):  # An error where anything waits for the GPU

@@ -106,7 +106,8 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     assert sorted(launched) == [*["activate"] * 2, "adam_step", *["photometric_loss"] * 2, "quantize", "rasterize"]
-    assert "The kernels of rasterization could not be compiled and tried before training (no compiler)" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert "The kernels of rasterization could not be compiled and tried before training (no compiler)" in output
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())
     assert all(not optimizer.state for optimizer in trainer.optimizers.optimizers.values())
