@@ -1,4 +1,4 @@
-"""gsplat's projection with a backward pass of our own, in one launch.
+"""The projection, differentiable by a backward pass in one launch; `projection_forward` is the forward pass.
 
 gsplat's takes eight: it fills gradients with zeros, copies those that compositing gives it as parts of rows, and adds
 with atomic operations. Here each Gaussian's gradients are summed over the views in registers, and what else depends on
