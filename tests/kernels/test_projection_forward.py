@@ -161,7 +161,6 @@ def hard_scenes() -> dict[str, Scene]:
 @pytest.mark.hard_case(
     "Gaussians as thin needles across 1,600 px, far off the axis, or tiny",
     "the inverse of Σ2D errs by less than 1e-5, where that by `ac − b²` in float32 errs by a tenth and more",
-    "name",
 )
 @pytest.mark.parametrize("name", hard_scenes())
 def test_conics_are_exact_where_the_determinant_cancels(name: str):
@@ -203,7 +202,6 @@ BROKEN = {
 @pytest.mark.hard_case(
     "NaN, infinity or 3e38 in a Gaussian's parameters, or a quaternion of zeros",
     "it is not drawn, as in gsplat; the others are",
-    "value",
 )
 @pytest.mark.parametrize("value", BROKEN)
 def test_what_has_no_finite_projection_is_not_drawn(value: str, per_axis_radii: bool, monkeypatch: Any):

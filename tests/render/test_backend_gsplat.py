@@ -105,7 +105,7 @@ def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
         gsplat.spherical_harmonics(0, torch.ones(1, 3), torch.ones(1, 1, 3))
 
 
-@pytest.mark.hard_case("gsplat's CUDA code was never compiled", "the Triton backend draws", "case")
+@pytest.mark.hard_case("gsplat's CUDA code was never compiled", "the Triton backend draws")
 @pytest.mark.parametrize("case", ["depth", "near plane", "features"])
 def test_the_triton_backend_draws_without_gsplats_kernels(
     case: str, hidden: None, monkeypatch: pytest.MonkeyPatch
