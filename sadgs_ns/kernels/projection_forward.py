@@ -165,7 +165,7 @@ def project_forward(
     conics = means.new_empty((*shape, 3))
     _project_forward[cdiv(len(means), _LANES),](
         means, quats, scales, opacities, viewmats, Ks, radii, means2d, depths, conics,
-        len(means), len(viewmats), width, height, near_plane,
+        len(means), len(viewmats), width, height, float(near_plane),  # Triton would take an integer for another type.
         FAR_PLANE, SCREEN_BLUR, radii.dim() - 1, _LANES,
     )  # fmt: skip
     return radii, means2d, depths, conics
