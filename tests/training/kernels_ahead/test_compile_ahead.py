@@ -63,6 +63,7 @@ launch(replace(choice, views=4, size=(1600, 1200)))
 print(len(found), missing)
 missing.clear()
 launch(replace(choice, has_color_matrices=True))
+launch(replace(choice, has_color_matrices=True, learns_color_matrices=True))
 print(sorted(missing))
 """
 
