@@ -103,6 +103,15 @@ def points_at_median(observations: Observations, stops: Floats, num_points: int)
     return _medians(values, observations.points, num_points)
 
 
+def mean_gains(observations: Observations, stops: Floats, num_points: int) -> Floats:
+    """Return the mean of log₂ of the gains [V, 3] of the photos that see each point; 0 if none does. [P, 3]"""
+    counts = np.bincount(observations.points, minlength=num_points)
+    columns = []
+    for channel in stops[observations.views].T:
+        columns.append(np.bincount(observations.points, channel, num_points) / np.maximum(counts, 1))
+    return np.stack(columns, axis=1)
+
+
 def gains_of_others(observations: Observations, points: Floats, num_views: int) -> tuple[Floats, NDArray[np.bool_]]:
     """Return log₂ of the gains of photos that had no part in the points' colours [P, 3], and whether each is known.
 

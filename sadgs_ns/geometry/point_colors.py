@@ -34,14 +34,6 @@ def apply_gains(
     return image * gains + OFFSET * (gains - 1) * alpha
 
 
-def srgb_of(
-    stops: Tensor,  # log₂ of linear light [..., 3]
-) -> Tensor:
-    """Return sRGB's values in [0, 1] of light. [..., 3]"""
-    values = (1 + OFFSET) * torch.exp2(stops / EXPONENT) - OFFSET
-    return values.clamp(0, 1)
-
-
 HIDDEN_CELLS = 40
 """Cells to the width of a photo; points behind the nearest one in their cell count as hidden."""
 HIDDEN_DEPTH = 1.05

@@ -23,7 +23,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
 from sadgs_ns.geometry.extents import camera_extent
 from sadgs_ns.geometry.initialization import neighbour_scales
-from sadgs_ns.geometry.point_colors import apply_gains, srgb_of
+from sadgs_ns.geometry.point_colors import apply_gains, srgb_gains
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.running_strategy import RunningStrategy
@@ -84,7 +84,7 @@ class SadgsModel(SplatfactoModel):
         if config.color_model == "affine":
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
         self.exposure: ExposureTable | None = None  # Stored with the extra state, as its size is that of the data
-        self.gain_of_held_out: Callable[[int], Tensor | None] = lambda index: None
+        self.gain_of_held_out: Callable[[Mapping[str, Any]], Tensor | None] = lambda data: None
         self.register_buffer("gain_matrices", None, persistent=False)  # Those of `exposure`. [V, 3, 4]
         # An index that is made in a step must be copied to the device in that step.
         self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
@@ -213,20 +213,27 @@ class SadgsModel(SplatfactoModel):
         if table is not None:
             self.gain_matrices = table.matrices().to(self.device)
 
-    def color_points(self) -> None:
-        """Give the Gaussians of SfM points the points' colours at the median exposure; call before training."""
-        if self.exposure is None or self.seed_points is None or not len(self.exposure.points):
+    def color_points(self, stops: Tensor) -> None:
+        """Bring the Gaussians of SfM points to the median exposure; call before training.
+
+        The points' colours are means over photos, and `stops` [P, 3] are log₂ of these photos' mean gains.
+        """
+        if self.seed_points is None:
             return
-        points = self.seed_points[0].float().cpu()
-        known = self.exposure.points.isfinite().all(dim=1) & points.isfinite().all(dim=1)
-        real = (~self.synthetic).nonzero()[:, 0]
+        positions, colors = self.seed_points
+        real = (~self.synthetic).nonzero()[:, 0].to(self.device)
+        points = positions.float().cpu()
+        known = points.isfinite().all(dim=1)
         if not known.any() or not len(real):
             return
-        distances, nearest = KDTree(points[known]).query(self.means.detach()[real.to(self.device)].cpu())
+        # Each of these Gaussians begins at a point, and some points have none.
+        distances, nearest = KDTree(points[known]).query(self.means.detach()[real].cpu())
         found = torch.from_numpy(distances == 0)
-        light = self.exposure.points[known][torch.from_numpy(nearest)[found]]
-        features = color_features(srgb_of(light), self.config.sh_degree)
-        self.gauss_params["features_dc"].data[real[found].to(self.device)] = features.to(self.device)
+        rows = torch.from_numpy(nearest)[found]
+        to_median = 1 / srgb_gains(stops[known][rows])
+        at_median = apply_gains(colors[known][rows].cpu() / 255, to_median).clamp(0, 1)
+        features = color_features(at_median, self.config.sh_degree).to(self.gauss_params["features_dc"])
+        self.gauss_params["features_dc"].data[real[found.to(self.device)]] = features
 
     @property
     def has_view_colors(self) -> bool:
@@ -499,7 +506,7 @@ class SadgsModel(SplatfactoModel):
         """
         if self.exposure is None:
             return None
-        gains = self.gain_of_held_out(int(batch["image_idx"]))
+        gains = self.gain_of_held_out(batch)
         if gains is None:
             return None
         alpha = outputs["accumulation"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property, partial
 from pathlib import Path
@@ -132,23 +133,23 @@ class SadgsPipeline(VanillaPipeline):
     def _held_out_observations(self) -> PointObservations | None:
         return self.point_observations("eval")
 
-    def _gain_of_held_out(self, index: int) -> Tensor | None:
+    def _gain_of_held_out(self, data: Mapping[str, Any]) -> Tensor | None:
         """Return the factors of sRGB's values of a held-out photo [3], 1 if it has too few points.
 
-        They come from the colours that points have in the training photos, or from EXIF if there are no points. None
-        if the points are others than those of training.
+        `data` is what the datamanager gives for it. The factors come from the colours that points have in the training
+        photos, or from EXIF if there are no points. None if the points are others than those of training.
         """
         table = self.model.exposure
         if table is None:
             return None
         files = self.datamanager.eval_dataset.image_filenames
+        index = int(data["image_idx"])
         if len(table.points) == 0:
             return srgb_gains(self._stops_by_exif(files[index]))
-        images = self.datamanager.cached_eval  # Undistorting them changes their cameras.
         observing = self._held_out_observations
         if observing is None or len(observing.points) != len(table.points):
             return None
-        observations = observing.of_one(index, images[index])
+        observations = observing.of_one(index, data)
         stops, _ = gains_of_others(observations, table.points.double().numpy(), 1)
         return srgb_gains(torch.from_numpy(stops[0]))
 

@@ -10,7 +10,15 @@ from torch import Tensor
 
 from sadgs_ns.data.exif_exposure import exposures_of
 from sadgs_ns.distributed.world import World
-from sadgs_ns.geometry.exposure import FEWEST_POINTS, Exposures, fit_exposures, gains_of_others, points_at_median
+from sadgs_ns.geometry.exposure import (
+    FEWEST_POINTS,
+    Exposures,
+    Observations,
+    fit_exposures,
+    gains_of_others,
+    mean_gains,
+    points_at_median,
+)
 from sadgs_ns.training.exposure_table import ExposureTable, photo_names
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.progress import note, warn
@@ -30,6 +38,7 @@ class _Found:
 
     stops: Tensor  # float64 [V, 3]
     points: Tensor  # float32 [P, 3]
+    observations: Observations | None  # Of the points, if these told the gains
     used: bool
     sentence: str  # For the user
 
@@ -56,7 +65,9 @@ def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     world.broadcast(points, 0)
     names = photo_names(pipeline.datamanager.train_dataset.image_filenames)
     model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
-    model.color_points()
+    if found.observations is not None:
+        means = mean_gains(found.observations, stops.cpu().numpy(), len(points))
+        model.color_points(torch.from_numpy(means).float())
 
 
 def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
@@ -111,16 +122,16 @@ def _find(pipeline: SadgsPipeline) -> _Found | None:
         if fitted.known.any():
             if tags is not None:
                 _warn_of_disagreement(fitted, tags)
-            return _by_points(fitted, observing.has_tracks)
+            return _by_points(fitted, observations, observing.has_tracks)
     if tags is None:
         return None
     stops = np.array(tags) - np.median(tags)
     used = bool(stops.std() >= LEAST_DEVIATION)
     sentence = _sentence(float(stops.std()), float(np.ptp(stops)), "by EXIF", used)
-    return _Found(torch.from_numpy(stops)[:, None].repeat(1, 3), torch.zeros((0, 3)), used, sentence)
+    return _Found(torch.from_numpy(stops)[:, None].repeat(1, 3), torch.zeros((0, 3)), None, used, sentence)
 
 
-def _by_points(fitted: Exposures, has_tracks: bool) -> _Found:
+def _by_points(fitted: Exposures, observations: Observations, has_tracks: bool) -> _Found:
     """Decide whether gains that were fitted to points are used."""
     needed = LEAST_PROJECTED_REDUCTION
     if has_tracks:
@@ -131,7 +142,8 @@ def _by_points(fitted: Exposures, has_tracks: bool) -> _Found:
     without = int((~fitted.known).sum())
     if used and without:
         sentence += f" {without} of them share fewer than {FEWEST_POINTS} points with others, and have a gain of 1."
-    return _Found(torch.from_numpy(fitted.stops), torch.from_numpy(fitted.points).float(), used, sentence)
+    points = torch.from_numpy(fitted.points).float()
+    return _Found(torch.from_numpy(fitted.stops), points, observations, used, sentence)
 
 
 def _sentence(deviation: float, spread: float, source: str, used: bool) -> str:
