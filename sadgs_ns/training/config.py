@@ -109,13 +109,8 @@ class SadgsModelConfig(InstantiateConfig):
     exposure: Literal["auto", "off"] = "auto"
     """Whether photos are compared with renderings at their own exposure if exposure varies between them.
     Their gains come from the colours of common SfM points, or from EXIF. The splat has the median exposure."""
-    color_corrected_metrics: bool = False
+    color_corrected_metrics: Suppress[bool] = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
-
-    @property
-    def uses_gains(self) -> bool:
-        """Whether photos may have gains; learned colour matrices would be another answer to the same question."""
-        return self.exposure == "auto" and self.color_model == "none"
 
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""

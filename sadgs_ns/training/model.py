@@ -206,6 +206,11 @@ class SadgsModel(SplatfactoModel):
         self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
         return groups  # type: ignore[return-value]
 
+    @property
+    def may_use_gains(self) -> bool:
+        """Whether photos may have gains; learned colour matrices are another answer to the same question."""
+        return self.config.exposure == "auto" and self.config.color_model == "none"
+
     def set_exposure(self, table: ExposureTable | None) -> None:
         """From now on, compare training photos with renderings at their exposure, or with plain ones if it is None."""
         self.exposure = table

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import ExifTags, Image
@@ -12,9 +14,9 @@ from sadgs_ns.data.exif_exposure import exposure_stops, exposures_of
 TAGS = {ExifTags.Base.ExposureTime: 1 / 50, ExifTags.Base.FNumber: 2.0, ExifTags.Base.ISOSpeedRatings: 200}
 
 
-def photo(path: Path, tags: dict[int, float]) -> Path:
+def photo(path: Path, tags: Mapping[Any, float]) -> Path:
     exif = Image.Exif()
-    exif.get_ifd(ExifTags.IFD.Exif).update(tags)
+    exif.get_ifd(ExifTags.IFD.Exif).update(dict(tags))
     Image.new("RGB", (8, 8), "grey").save(path, exif=exif)
     return path
 

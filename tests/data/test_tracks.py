@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ def text_model(model: Path, folder: Path) -> Path:
     from nerfstudio.data.utils import colmap_parsing_utils
 
     folder.mkdir()
-    colmap_parsing_utils.write_model(*colmap_parsing_utils.read_model(str(model)), str(folder), ext=".txt")
+    read: Any = colmap_parsing_utils.read_model(str(model))
+    cameras, images, points = read
+    colmap_parsing_utils.write_model(cameras, images, points, str(folder), ext=".txt")
     return folder / "points3D.txt"
 
 

@@ -49,7 +49,7 @@ def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     All processes have the gains of the first. It loads the images. Call it before points of stereo depth are added.
     """
     model = pipeline.model
-    if not model.config.uses_gains:
+    if not model.may_use_gains:
         return
     found = _find(pipeline)
     if found is None:
@@ -80,7 +80,7 @@ def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     before = model.exposure
     if before is None:
         return
-    if not model.config.uses_gains:
+    if not model.may_use_gains:
         model.set_exposure(None)
         return
     dataset = pipeline.datamanager.train_dataset

@@ -201,7 +201,7 @@ def with_exif(folder: Path, name: str) -> NerfstudioDataParserConfig:
         file = drawn.with_suffix(".jpg")
         frame["file_path"] = f"images/{file.name}"
         exif = Image.Exif()
-        tags = {ExifTags.Base.ExposureTime: 0.01 * 2.0 ** -(index % 2)}
+        tags: dict[Any, float] = {ExifTags.Base.ExposureTime: 0.01 * 2.0 ** -(index % 2)}
         tags |= {ExifTags.Base.FNumber: 4.0, ExifTags.Base.ISOSpeedRatings: 100}
         exif.get_ifd(ExifTags.IFD.Exif).update(tags)
         Image.open(drawn).save(file, exif=exif, quality=98)

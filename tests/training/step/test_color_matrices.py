@@ -55,12 +55,13 @@ def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 33, 47))
     results = []
     for learned in (True, False):
-        inputs = [value.clone().requires_grad_() for value in (render, alpha)]
+        colors = render.clone().requires_grad_()
+        opacity = alpha.clone().requires_grad_()
         of_views = matrices.clone().requires_grad_(learned)
-        corrected = correct_colors(*inputs, of_views)
+        corrected = correct_colors(colors, opacity, of_views)
         corrected.backward(upstream)
         assert (of_views.grad is not None) == learned
-        results.append([corrected.detach(), *[value.grad for value in inputs]])
+        results.append([corrected.detach(), colors.grad, opacity.grad])
     for expected, found in zip(*results, strict=True):
         assert torch.equal(expected, found)
 
