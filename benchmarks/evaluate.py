@@ -111,14 +111,15 @@ def quality(
 
 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
-    """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
+    """Return the PSNR of each view in dB as other programs' viewers show the exported file.
 
-    `view_psnr`, which `quality` measured, is returned unless the model's plan has a near plane beyond theirs.
+    They draw from NEAR_PLANE on, and Gaussians at any distance off the axis. `view_psnr`, which `quality` measured, is
+    returned if the model's plan does so, too.
     """
     plan = getattr(model, "plan", None)  # Models of other methods have none.
-    if plan is None or plan.near_plane <= NEAR_PLANE:
+    if plan is None or (plan.near_plane <= NEAR_PLANE and plan.max_off_axis == 0):
         return view_psnr
-    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE)
+    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE, max_off_axis=0.0)
     try:
         return quality(model, views)["view_psnr"]
     finally:

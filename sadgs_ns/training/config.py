@@ -67,7 +67,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Whether and how the cameras' poses are refined in training."""
     backend: BackendName = "auto"
     """Which code draws: auto takes Triton kernels where they work, gsplat on other CUDA devices, and torch elsewhere.
-    gsplat trains on one GPU, without CUDA graphs."""
+    gsplat trains on one GPU, without CUDA graphs, and alone needs nvcc."""
     background_color: Literal["black", "white"] = "black"
     """Colour behind the Gaussians."""
     random_init: bool = False
