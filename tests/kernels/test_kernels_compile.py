@@ -22,7 +22,7 @@ CONSTANTS = {
     "VIEWS": 2, "BLOCK": 1024, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "HIGHEST": 4.0, "FAR": 1e10,
     "OCTAVES": 12.0, "INVALID": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
-    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
+    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "LEARNED": True, "CULL": True,
     "DEPTHS": True, "PASSED": True, "FLAGS": 1, "FEW": 64,
     "PART": 256,
 }
