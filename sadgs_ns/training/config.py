@@ -95,12 +95,13 @@ class SadgsModelConfig(InstantiateConfig):
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; with 0 it has the parameters of the last iteration."""
-    max_off_axis: float = 4.0
+    max_off_axis: float = 0.0
     """Gaussians whose centre is projected farther than this from the image's centre, in half images, are not drawn.
-    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
-    near_plane: float | None = None
+    0 draws all, as other programs draw the exported file."""
+    near_plane: Literal["viewers", "scene"] | float = "viewers"
     """Depth from which Gaussians are drawn, in training and later, in the run's units.
-    None is half the depth of a training camera's fifth nearest SfM point, for the camera where this is least."""
+    "viewers" is 0.01, from which other programs draw the exported file. "scene" is half the depth of a training
+    camera's fifth nearest SfM point, for the camera where this is least; "viewers" is never more than that."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one that lies beside a view can cover it with haze; 0 sets no limit."""
@@ -115,6 +116,9 @@ class SadgsModelConfig(InstantiateConfig):
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""
         near = self.near_plane
+        is_near_plane = near in ("viewers", "scene", None)  # Runs of before have None for "scene".
+        if not is_near_plane:
+            is_near_plane = not isinstance(near, str) and 0 < near < math.inf
         stereo = self.stereo_points
         off_axis = self.max_off_axis
         angle = self.max_angular_scale
@@ -127,7 +131,7 @@ class SadgsModelConfig(InstantiateConfig):
             ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
             ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
             ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
-            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
+            ("near_plane", is_near_plane, "viewers, scene, or positive and finite"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
             ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
             ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),

@@ -125,7 +125,7 @@ class SadgsModel(SplatfactoModel):
     def clear_paths(self, viewmats: Tensor, near_plane: float) -> None:
         """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it.
 
-        `near_plane` is the depth from which Gaussians will be drawn.
+        `near_plane` is the scene's (`scene_near_plane`), which need not be the run's.
         """
         if not self.config.clear_paths:
             return

@@ -118,7 +118,7 @@ class SadgsPipeline(VanillaPipeline):
     def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
         """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
 
-        It loads the images' cameras, so call it after `decide_near_plane`. Raises as `PointObservations`.
+        It loads the images' cameras, so call it after `near_plane_of_scene`. Raises as `PointObservations`.
         """
         if self.model.seed_points is None:
             return None

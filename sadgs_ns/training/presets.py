@@ -54,7 +54,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             ssim_lambda=0.2,
             opacity_reg=0.0,
             averaged_share=0.0,
-            max_off_axis=0.0,
+            near_plane="scene",
             max_angular_scale=0.0,
             stereo_points=0,
             exposure="off",

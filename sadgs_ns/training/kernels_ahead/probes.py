@@ -24,7 +24,7 @@ from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
 # Number of Gaussians, and width and height in px, with which the kernels are tried
 _GAUSSIANS = 64
 _SIZE = 64
-_DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
+_DRAWING = RenderOptions(backend="triton")
 
 
 @dataclass(frozen=True)
