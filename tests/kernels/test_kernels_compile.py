@@ -23,7 +23,7 @@ CONSTANTS = {
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "HIGHEST": 4.0,
     "OCTAVES": 12.0, "INVALID": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
-    "DEPTHS": True, "PASSED": True, "FLAGS": 1, "FEW": 64,
+    "DEPTHS": True, "PASSED": True, "POSES": True, "FLAGS": 1, "FEW": 64,
     "PART": 256,
 }
 INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
