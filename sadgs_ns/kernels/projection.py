@@ -2,8 +2,8 @@
 
 gsplat's takes eight: it fills gradients with zeros, copies those that compositing gives it as parts of rows, and adds
 with atomic operations. Here each Gaussian's gradients are summed over the views in registers, and what else depends on
-the centres is added on the way. Gradients by the cameras are sums over blocks of Gaussians, which torch adds up, so that
-they come out the same each time. The formulas are those of gsplat 1.4.0 and 1.5.3.
+the centres is added on the way. Gradients by the cameras are sums over blocks of Gaussians, which torch adds up: they
+come out the same each time. The formulas are those of gsplat 1.4.0 and 1.5.3.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
+    moves_cameras: bool = False  # Whether the cameras' poses have gradients
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
@@ -163,13 +164,15 @@ class Stages:
         from sadgs_ns.kernels.projection import project
 
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
-        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
+        viewmats = self.cameras.viewmats.clone().requires_grad_(self.choice.moves_cameras)
+        cameras = self.cameras._replace(viewmats=viewmats)
+        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *cameras)
         results = [means2d, conics]
         degree = self.choice.sh_degree
         if degree > 0:
             num_rest = (degree + 1) ** 2 - 1
             rest = self.means.new_zeros((_GAUSSIANS, num_rest, 3))
-            results.append(colors_from_harmonics(degree, centres, self.means, rest, self.cameras.viewmats, radii))
+            results.append(colors_from_harmonics(degree, centres, self.means, rest, viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])
 
     def observation(self) -> None:

@@ -24,6 +24,7 @@ from sadgs_ns.training.step import cuda_graphs, optimizers
 from sadgs_ns.training.step.cuda_graphs import Results
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
+backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
 
 ITERATIONS = 20
 on_cpu = pytest.mark.skipif(torch.cuda.is_available(), reason="on the CPU Triton is interpreted")
@@ -125,11 +126,14 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
 
 
 @on_cpu
-@pytest.mark.parametrize("color_model", ["none", "affine"])
+@pytest.mark.parametrize(("color_model", "poses"), [("none", "fixed"), ("affine", "fixed"), ("none", "refined")])
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
-    color_model: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+    color_model: Any, poses: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
+    drawn_by_gsplat: list[Any] = []
+    monkeypatch.setattr(backend_triton, "colors_in_views", lambda *views: drawn_by_gsplat.append(views))
     short.pipeline.model.color_model = color_model
+    short.pipeline.model.poses = poses
     short.pipeline.views_per_iteration = 2
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
@@ -137,6 +141,10 @@ def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     assert expected == found
     assert_equal(tensors(launched), tensors(replayed))
     assert len({count for *_, count, _ in expected[1::2]}) > 2
+    assert not drawn_by_gsplat
+    if poses == "refined":
+        found_poses = replayed.pipeline.model.poses
+        assert found_poses is not None and (found_poses.table.detach() != 0).all()
 
 
 # --- one step ---
@@ -311,11 +319,11 @@ def test_steps_of_many_gaussians_or_of_masked_views_are_launched_one_by_one(
     "change",
     [
         lambda config: setattr(config, "cuda_graphs", False),
-        lambda config: setattr(config.pipeline.model.camera_optimizer, "mode", "SO3xR3"),
+        lambda config: setattr(config.pipeline.model, "backend", "torch"),
     ],
     ids=[
         "switched off",
-        "camera optimizer",
+        "another backend",
     ],
 )
 @on_cpu
