@@ -73,14 +73,16 @@ class AdamUpdate:
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
         for name, adam in self._tables.items():
             table = self.parameters[name]
-            if not adam.state[table]:
-                adam.state[table].update(empty_moments(table))
+            state = adam.state[table]
+            if not state:
+                state.update(empty_moments(table))
+            state["step"] = state["step"].to(table.device)  # A checkpoint's may be on the host.
         self.exp_avgs = tuple(state["exp_avg"] for state in self._states if state)
         self.exp_avg_sqs = tuple(state["exp_avg_sq"] for state in self._states if state)
 
     def tensors(self) -> list[Tensor]:
         """Return all tensors that an update changes in place."""
-        counts = [adam.state[self.parameters[name]]["row_updates"] for name, adam in self._tables.items()]
+        counts = [adam.state[self.parameters[name]]["step"] for name, adam in self._tables.items()]
         return [*self.parameters.values(), *self.exp_avgs, *self.exp_avg_sqs, *counts]
 
     def factors(self) -> Tensor:

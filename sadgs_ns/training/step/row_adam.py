@@ -6,6 +6,7 @@ five times as far as its learning rate says. Here a row moves only in a step tha
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -28,7 +29,7 @@ def empty_moments(
     return {
         "exp_avg": torch.zeros_like(table),
         "exp_avg_sq": torch.zeros_like(table),
-        "row_updates": torch.zeros_like(table[:, 0]),
+        "step": torch.zeros_like(table[:, 0]),
     }
 
 
@@ -49,12 +50,14 @@ def move_rows(
     moved = update.moved[:, None]
     mean = state["exp_avg"]
     square = state["exp_avg_sq"]
-    count = state["row_updates"]
+    count = state["step"]
     mean.copy_(torch.where(moved, mean.lerp(gradient, 1 - betas[0]), mean))
     square.copy_(torch.where(moved, square.lerp(gradient.square(), 1 - betas[1]), square))
     count += update.moved
     done = count.clamp_min(1.0)[:, None]
-    mean_of_all = mean / (1 - betas[0] ** done)
-    root = (square / (1 - betas[1] ** done)).sqrt()
-    change = rate * update.units * mean_of_all / (root + eps)
+    # 1 − β^t, which float32 would cancel: the weights of all updates so far.
+    mean_weight = -torch.expm1(done * math.log(betas[0]))
+    square_weight = -torch.expm1(done * math.log(betas[1]))
+    root = (square / square_weight).sqrt()
+    change = rate * update.units * (mean / mean_weight) / (root + eps)
     table -= torch.where(moved, change, 0.0)

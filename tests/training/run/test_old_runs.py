@@ -129,7 +129,7 @@ def test_an_old_run_goes_on_with_the_command_that_it_printed(resumable: Path, ca
         float(moments["step"]) for group in after["optimizers"].values() for moments in group["state"].values()
     }
     assert steps_done == {ITERATIONS}
-    assert float(poses["state"][0]["row_updates"].sum()) == 2 * (ITERATIONS - DONE)
+    assert float(poses["state"][0]["step"].sum()) == 2 * (ITERATIONS - DONE)
     assert before["pipeline"]["_model.camera_optimizer.pose_adjustment"].any()
     assert after["pipeline"]["_model.poses.table"].all()
 
