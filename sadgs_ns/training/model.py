@@ -493,7 +493,6 @@ class SadgsModel(SplatfactoModel):
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
 
-
     def _load_poses(self, state: dict[str, Any]) -> None:
         """Put poses that fit this model into a checkpoint's state: its own, those of an earlier version, or none."""
         table = state.pop("poses.table", None)

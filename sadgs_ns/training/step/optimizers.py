@@ -138,7 +138,6 @@ class AdamUpdate:
                 overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 
-
     def _move_tables(
         self, gradients: Mapping[str, Tensor], factors: Tensor, nonfinite_flag: Tensor, rows: RowUpdate
     ) -> None:

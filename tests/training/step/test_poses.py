@@ -165,7 +165,9 @@ def test_fixed_poses_stay_and_are_no_part_of_a_run(colmap: ColmapDataParserConfi
 def disturb(scene: Path) -> dict[str, np.ndarray]:
     """Turn each training camera of a drawn scene about its centre; return the true matrices by the images' names."""
     folder = str(scene / SPARSE_FOLDER)
-    cameras, images, points = colmap_parsing_utils.read_model(folder)
+    model = colmap_parsing_utils.read_model(folder)
+    assert model is not None
+    cameras, images, points = model
     rng = np.random.default_rng(0)
     true = {}
     for number, image in images.items():
