@@ -20,6 +20,8 @@ from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
+from sadgs_ns.training.step.poses import corrected_views
+from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
 
 # Number of Gaussians, and width and height in px, with which the kernels are tried
 _GAUSSIANS = 64
@@ -78,6 +80,8 @@ class Stages:
         }
         if self.choice.has_color_matrices:
             stages["colour matrices"] = self.colors
+        if self.choice.moves_cameras:
+            stages["poses"] = self.poses
         return stages
 
     def after_projection(self) -> dict[str, Callable[[], None]]:
@@ -119,6 +123,16 @@ class Stages:
         alphas = torch.zeros((*shape, 1), device=self.device, requires_grad=True)
         matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1).requires_grad_()
         correct_colors(renders, alphas, matrices).sum().backward()
+
+    def poses(self) -> None:
+        table = torch.zeros((self.views, 6), device=self.device, requires_grad=True)
+        view_ids = torch.arange(self.views, device=self.device)
+        corrected_views(self.cameras.viewmats, table, view_ids).sum().backward()
+        moved = RowUpdate(torch.zeros(self.views, dtype=torch.bool, device=self.device), torch.zeros_like(table))
+        rate = torch.zeros(1, device=self.device)[0]
+        state = empty_moments(table.detach())
+        flag = torch.zeros(1, device=self.device)
+        move_rows(table.detach(), torch.zeros_like(table), state, moved, rate, (0.9, 0.999), 1e-15, flag)
 
     def update(self) -> None:
         from sadgs_ns.kernels.adam import adam_step

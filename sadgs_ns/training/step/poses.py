@@ -11,9 +11,23 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.geometry.poses import Gauge, corrected, image_motion, pixel_steps, view_depths
+from sadgs_ns.kernels import use_triton
 from sadgs_ns.training.step.row_adam import RowUpdate
 
 _POINTS = 5000  # Points, at equal distances among all, from which the depths of views are taken
+
+
+def corrected_views(
+    initial: Tensor,  # World-to-camera matrices of C views before correction. [C, 4, 4]
+    table: Tensor,  # Corrections of all views. [V, 6]
+    view_ids: Tensor,  # Indices of the views. int64 [C]
+) -> Tensor:
+    """Return the corrected matrices of views, differentiable by the table. [C, 4, 4]"""
+    if use_triton(table):
+        from sadgs_ns.kernels.poses import corrected as fused_corrected
+
+        return fused_corrected(initial, table, view_ids)
+    return corrected(initial, table.index_select(0, view_ids))
 
 
 class RefinedPoses(torch.nn.Module):
@@ -54,7 +68,7 @@ class RefinedPoses(torch.nn.Module):
         """Return the corrected matrices of views, differentiable by `table`, which is the module's by default."""
         if table is None:
             table = self.table
-        return corrected(initial, table.index_select(0, view_ids))
+        return corrected_views(initial, table, view_ids)
 
     @torch.no_grad()
     def viewmat(self, index: int) -> Tensor:

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sadgs_ns.training.step.nonfinite import leave_out_nonfinite
+from sadgs_ns.kernels import use_triton
+from sadgs_ns.training.step.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 
 
 class RowUpdate(NamedTuple):
@@ -44,7 +45,28 @@ def move_rows(
     eps: float,
     nonfinite_flag: Tensor,  # Becomes NaN if a gradient was not finite. float32 [1]
 ) -> None:
-    """Update some rows of a table in place, without waiting for the device; numbers that are not finite count as 0."""
+    """Update some rows of a table in place, without waiting for the device; numbers that are not finite count as 0.
+
+    A table [V, 6] on a device where Triton's kernels run takes one launch; its rate is a tensor, too.
+    """
+    if isinstance(rate, Tensor) and table.shape[1] == 6 and use_triton(table):
+        from sadgs_ns.kernels import poses
+
+        log_betas = math.log(betas[0]), math.log(betas[1])
+        poses.move_rows(
+            table,
+            gradient,
+            state,
+            update.moved,
+            update.units,
+            rate,
+            betas,
+            log_betas,
+            eps,
+            nonfinite_flag,
+            MAX_GRADIENT,
+        )
+        return
     gradient = gradient.clone()
     leave_out_nonfinite(gradient, nonfinite_flag)
     moved = update.moved[:, None]

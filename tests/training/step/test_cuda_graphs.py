@@ -20,7 +20,7 @@ from helpers.short_runs import configure
 from sadgs_ns import kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.run.trainer import SadgsTrainer
-from sadgs_ns.training.step import cuda_graphs, optimizers
+from sadgs_ns.training.step import cuda_graphs, optimizers, poses, row_adam
 from sadgs_ns.training.step.cuda_graphs import Results
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
@@ -64,7 +64,8 @@ class Reruns:
 def without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our rasterizer and Adam in Triton's interpreter, and graphs that are called again."""
     use_our_rasterizer(monkeypatch)
-    monkeypatch.setattr(optimizers, "use_triton", lambda place: True)
+    for module in (optimizers, poses, row_adam):
+        monkeypatch.setattr(module, "use_triton", lambda place: True)
     monkeypatch.setattr(cuda_graphs, "CudaGraphs", Reruns)
     monkeypatch.setattr(adam, "_BLOCK", 2**16)  # The interpreter runs one program after the other.
 
@@ -126,14 +127,14 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
 
 
 @on_cpu
-@pytest.mark.parametrize(("color_model", "poses"), [("none", "fixed"), ("affine", "fixed"), ("none", "refined")])
+@pytest.mark.parametrize(("color_model", "poses_are"), [("none", "fixed"), ("affine", "fixed"), ("none", "refined")])
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
-    color_model: Any, poses: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+    color_model: Any, poses_are: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
     drawn_by_gsplat: list[Any] = []
     monkeypatch.setattr(backend_triton, "colors_in_views", lambda *views: drawn_by_gsplat.append(views))
     short.pipeline.model.color_model = color_model
-    short.pipeline.model.poses = poses
+    short.pipeline.model.poses = poses_are
     short.pipeline.views_per_iteration = 2
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
@@ -142,7 +143,7 @@ def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     assert_equal(tensors(launched), tensors(replayed))
     assert len({count for *_, count, _ in expected[1::2]}) > 2
     assert not drawn_by_gsplat
-    if poses == "refined":
+    if poses_are == "refined":
         found_poses = replayed.pipeline.model.poses
         assert found_poses is not None and (found_poses.table.detach() != 0).all()
 
