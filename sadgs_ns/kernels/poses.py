@@ -1,4 +1,4 @@
-"""Refined poses: `geometry.poses.corrected` of a table's rows, and `training.step.row_adam.move_rows`, in one launch each.
+"""Refined poses: `geometry.poses.corrected` of rows and `training.step.row_adam.move_rows`, in a launch each.
 
 In torch they take a hundred launches of a few numbers each, which a step of few Gaussians feels.
 """
@@ -175,6 +175,6 @@ def move_rows(
     """Do what `training.step.row_adam.move_rows` does for a table [V, 6]; `rate` is on the device. [1]"""
     rows = len(table)
     _move_rows[cdiv(rows, _ROWS),](
-        table, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], state["step"], moved.view(torch.uint8), units, rate,
-        nonfinite_flag, rows, *betas, *log_betas, eps, max_gradient, _ROWS,
+        table, gradient.contiguous(), state["exp_avg"], state["exp_avg_sq"], state["step"],
+        moved.view(torch.uint8), units, rate, nonfinite_flag, rows, *betas, *log_betas, eps, max_gradient, _ROWS,
     )  # fmt: skip

@@ -112,7 +112,7 @@ def assert_same_cameras(cameras: Any, expected: Any) -> None:
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, other)
         else:  # Ours also know which training views they are.
-            others = {name: known for name, known in value.items() if name != TRAINING_VIEW}
+            others = {name: known for name, known in (value or {}).items() if name != TRAINING_VIEW}
             assert others == (other or {})
 
 
