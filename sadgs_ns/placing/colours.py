@@ -42,7 +42,8 @@ def _is_adobe_rgb_by_exif(image: Image.Image) -> bool:
     """Return whether a photo has no profile, and EXIF tells of Adobe RGB as the standard of camera files wants it."""
     if image.mode != "RGB" or image.format not in _CAMERA_FORMATS or "icc_profile" in image.info:
         return False
-    with contextlib.suppress(*UNREADABLE):  # EXIF may be damaged.
+    # EXIF may be damaged, and Pillow 11 raises KeyError where it has no part on interoperability.
+    with contextlib.suppress(*UNREADABLE, KeyError):
         exif = image.getexif()
         if exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.ColorSpace) == _UNCALIBRATED:
             index = exif.get_ifd(ExifTags.IFD.Interop).get(_INDEX)

@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers import gsplat_stub
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import backend_torch
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
@@ -21,12 +20,6 @@ N = 300
 WIDTH, HEIGHT = 40, 30
 OUTPUTS = ("means2d", "depths", "conics", "colors")
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.2)
-
-
-@pytest.fixture(autouse=True)
-def projection_in_torch(monkeypatch: pytest.MonkeyPatch) -> None:
-    if DEVICE.type == "cpu":  # gsplat's kernels need CUDA
-        monkeypatch.setattr(gsplat_compat, "project", gsplat_stub.project)
 
 
 def scene(num_views: int) -> dict[str, Tensor]:

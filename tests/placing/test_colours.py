@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from helpers.drawn_photos import color_profile
 from sadgs_ns.placing.conversion import convert_photos
@@ -65,4 +65,20 @@ def test_adobe_rgb_that_exif_tells_becomes_srgb(colour: Any, orientation: int, t
 def test_other_photos_keep_their_colours(name: str, mode: str, options: dict[str, Any], tmp_path: Path):
     Image.new(mode, (32, 16), (200, 30, 30) if mode == "RGB" else 90).save(tmp_path / name, **options)
     is_unchanged, _ = converted(tmp_path, name)
+    assert is_unchanged
+
+
+def test_photos_keep_their_colours_where_pillow_11_finds_no_part_on_interoperability(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    get_ifd = Image.Exif.get_ifd
+
+    def get_ifd_of_pillow_11(exif: Image.Exif, tag: int) -> dict[int, Any]:
+        if tag == ExifTags.IFD.Interop:
+            raise KeyError(tag)
+        return get_ifd(exif, tag)
+
+    Image.new("RGB", (32, 16), (200, 30, 30)).save(tmp_path / "a.jpg", exif=exif_of(65535, "R98"))
+    monkeypatch.setattr(Image.Exif, "get_ifd", get_ifd_of_pillow_11)
+    is_unchanged, _ = converted(tmp_path, "a.jpg")
     assert is_unchanged

@@ -38,6 +38,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
+    learns_color_matrices: bool = False
     moves_cameras: bool = False  # Whether the cameras' poses have gradients
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
@@ -121,7 +122,8 @@ class Stages:
         shape = self.views, _SIZE, _SIZE
         renders = torch.zeros((*shape, 3), device=self.device, requires_grad=True)
         alphas = torch.zeros((*shape, 1), device=self.device, requires_grad=True)
-        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1).requires_grad_()
+        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1)
+        matrices.requires_grad_(self.choice.learns_color_matrices)
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def poses(self) -> None:

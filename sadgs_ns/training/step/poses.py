@@ -7,11 +7,14 @@ again after each step: held-out cameras, viewers and the file know nothing of it
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from sadgs_ns.geometry.poses import Gauge, corrected, image_motion, pixel_steps, view_depths
 from sadgs_ns.kernels import use_triton
+from sadgs_ns.training.run.checkpoints import check_number_of_views
 from sadgs_ns.training.step.row_adam import RowUpdate
 
 _POINTS = 5000  # Points, at equal distances among all, from which the depths of views are taken
@@ -120,3 +123,20 @@ class RefinedPoses(torch.nn.Module):
         still = torch.cat([vectors, torch.zeros_like(vectors)], dim=1)
         turned = corrected(self.initial, still)[:, :3, :3]
         return torch.cat([vectors, -(turned @ moves[..., None])[..., 0]], dim=1)
+
+
+def fit_poses(state: dict[str, Any], poses: RefinedPoses | None) -> None:
+    """Put poses that fit a model into the state of a checkpoint: its own, those of an earlier version, or none.
+
+    Raises InputError if the adjustments of an earlier version are for other views.
+    """
+    table = state.pop("poses.table", None)
+    adjustment = state.pop("camera_optimizer.pose_adjustment", None)
+    if poses is None:
+        return
+    if table is None and adjustment is not None:
+        check_number_of_views("camera_optimizer.pose_adjustment", adjustment, poses.table)
+        table = poses.of_pose_adjustment(adjustment)
+    if table is None:  # The poses were fixed.
+        table = torch.zeros_like(poses.table)
+    state["poses.table"] = table

@@ -19,7 +19,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.step.color_matrices import anchored, correct_colors
+from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import stack, stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
 from sadgs_ns.training.step.row_adam import RowUpdate
@@ -138,8 +138,11 @@ def _render_and_compare(
         model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
         infos.append(info)
         for band, colors, alphas in pictures:
-            if model.color_matrices is not None and group.view_ids is not None:
-                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
+            if model.has_view_colors and group.view_ids is not None:
+                view_ids = group.view_ids
+                if band is not None:
+                    view_ids = view_ids[band.view : band.view + 1]
+                colors = correct_colors(colors, alphas, model.view_matrices(leaves, view_ids))
             rgb = model.before_background(colors, alphas, model.background)
             pair = model.masked_pair(rgb, group.batch(band), model.background)
             loss, quality, views = _compare(pair, group, band, model.config.ssim_lambda, penalty)
