@@ -16,6 +16,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from rich.progress import track
 
 from sadgs_ns.data import colmap
+from sadgs_ns.data.cameras import mark_training_views
 from sadgs_ns.data.checks import splits
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
@@ -41,7 +42,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         self.config.cache_images = requested
         for dataset in (self.train_dataset, self.eval_dataset):
             splits.check_paths(dataset.image_filenames)
-            dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
+            mark_training_views(dataset.cameras, dataset.image_filenames, self.train_dataset.image_filenames)
             _check_sizes(dataset)
 
     def create_eval_dataset(self) -> InputDataset:

@@ -143,7 +143,7 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
     assert method.config.method_name == name
     assert method.description.startswith("Structure-aware densification")
     groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10)).gauss_params)
-    assert set(method.config.optimizers) == groups | {"camera_opt", "color_matrices"}
+    assert set(method.config.optimizers) == groups | {"poses", "color_matrices"}
 
 
 def test_presets_differ_where_their_comments_say():
@@ -197,7 +197,7 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     expected = """
         data output-dir experiment-name vis viewer.websocket-port viewer.websocket-host max-num-iterations
         steps-per-save load-dir load-checkpoint load-config machine.seed machine.device-type machine.num-devices
-        pipeline.model.camera-optimizer.mode pipeline.model.color-model pipeline.model.backend
+        pipeline.model.poses pipeline.model.color-model pipeline.model.backend
         pipeline.model.background-color pipeline.model.sh-degree pipeline.model.random-init pipeline.model.num-random
     """
     assert {f"--{name}" for name in expected.split()} <= set(options)

@@ -58,6 +58,8 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     world, peers = choose_processes(config, pipeline, length, world, peers)
     if not world.is_single:
         turn_viewer_off(config)
+        if pipeline.model.poses is not None:
+            note("The poses stay as they are: they are refined on one device only.")
         pipeline.model.shard(world)
     start_step = 0
     if resumed is not None:
