@@ -47,12 +47,30 @@ def load_lpips() -> LearnedPerceptualImagePatchSimilarity | None:
 
 
 @torch.no_grad()
-def render(model: Any, view: View) -> tuple[Tensor, Tensor]:
-    """Render a view in eval mode; also return the photograph over its background, in [0, 1]. [1, 3, H, W] both"""
+def render(model: Any, view: View) -> tuple[dict[str, Tensor], Tensor]:
+    """Render a view in eval mode, and return the renderings by the prefixes of their metrics, and the photograph.
+
+    The photograph lies over its background. All are [1, 3, H, W] and in [0, 1]. `cc_` has colours that were fitted to
+    the photograph, if the model's configuration asks for it, and `gain_` the photograph's exposure, which the colours
+    of SfM points tell, if the model was trained with gains.
+    """
+    from nerfstudio.model_components.lib_bilagrid import color_correct
+
     camera, batch = view
     outputs = model.get_outputs_for_camera(camera)
     truth = model.composite_with_background(model.get_gt_img(batch["image"]), outputs["background"])
-    return tuple(image[..., :3].clamp(0, 1).movedim(-1, 0)[None] for image in (outputs["rgb"], truth))  # type: ignore[return-value]
+    truth = truth[..., :3].clamp(0, 1)
+    images = {"": outputs["rgb"][..., :3].clamp(0, 1)}
+    if getattr(model.config, "color_corrected_metrics", False):
+        images["cc_"] = color_correct(images[""], truth)
+    if getattr(model, "exposure", None) is not None:  # Models of other methods have none.
+        images["gain_"] = model.at_exposure_of_photo(outputs, batch)
+    return {prefix: _as_batch(image) for prefix, image in images.items() if image is not None}, _as_batch(truth)
+
+
+def _as_batch(image: Tensor) -> Tensor:
+    """[H, W, 3] → [1, 3, H, W]"""
+    return image.movedim(-1, 0)[None]
 
 
 @torch.no_grad()
@@ -62,34 +80,30 @@ def quality(
     """Means over views of `psnr` in dB, `ssim` and `lpips`, which is None without the network.
 
     Where the model's configuration asks for `color_corrected_metrics`, each is there a second time, as `cc_psnr` and so
-    on, nerfstudio's names, of renderings whose colours were fitted to the photograph by quadratic least squares.
+    on, nerfstudio's names, of renderings whose colours were fitted to the photograph by quadratic least squares. Where
+    training used gains, `gain_psnr` and so on are of renderings with the photograph's exposure.
     `view_psnr` lists the PSNR of each view in their order: a mean over few views can be the work of one. The network is
     on the model's device during the call only, so that it takes no memory from training.
     """
-    from nerfstudio.model_components.lib_bilagrid import color_correct
     from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
-    prefixes = ("", "cc_") if getattr(model.config, "color_corrected_metrics", False) else ("",)
     measures: dict[str, Any] = {
         "psnr": partial(peak_signal_noise_ratio, data_range=1.0),
         "ssim": partial(structural_similarity_index_measure, data_range=1.0, sigma=1.5, kernel_size=11),
         "lpips": None if network is None else network.to(model.device),
     }
-    values: dict[str, list[float]] = {f"{prefix}{name}": [] for prefix in prefixes for name in measures}
+    values: dict[str, list[float]] = {name: [] for name in measures}
     # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace. Probably so a process
     # came to hold 133 GiB, for want of which another one on the same GPU failed here.
     cudnn = torch.backends.cudnn
     with cudnn.flags(enabled=True, benchmark=False, deterministic=False, allow_tf32=cudnn.allow_tf32):
         for view in views:
-            rendered, truth = render(model, view)
-            for prefix in prefixes:
-                image = rendered
-                if prefix:
-                    image, photo = (tensor[0].movedim(0, -1) for tensor in (rendered, truth))
-                    image = color_correct(image, photo).movedim(-1, 0)[None]
+            images, truth = render(model, view)
+            for prefix, image in images.items():
                 for name, measure in measures.items():
+                    of_views = values.setdefault(f"{prefix}{name}", [])
                     if measure is not None:
-                        values[f"{prefix}{name}"].append(float(measure(image, truth)))
+                        of_views.append(float(measure(image, truth)))
     if network is not None:
         network.cpu()
     means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
@@ -97,14 +111,15 @@ def quality(
 
 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:
-    """Return the PSNR of each view in dB as other programs' viewers show the exported file: from NEAR_PLANE on.
+    """Return the PSNR of each view in dB as other programs' viewers show the exported file.
 
-    `view_psnr`, which `quality` measured, is returned unless the model's plan has a near plane beyond theirs.
+    They draw from NEAR_PLANE on, and Gaussians at any distance off the axis. `view_psnr`, which `quality` measured, is
+    returned if the model's plan does so, too.
     """
     plan = getattr(model, "plan", None)  # Models of other methods have none.
-    if plan is None or plan.near_plane <= NEAR_PLANE:
+    if plan is None or (plan.near_plane <= NEAR_PLANE and plan.max_off_axis == 0):
         return view_psnr
-    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE)
+    model.plan = dataclasses.replace(plan, near_plane=NEAR_PLANE, max_off_axis=0.0)
     try:
         return quality(model, views)["view_psnr"]
     finally:

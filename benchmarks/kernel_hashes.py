@@ -16,11 +16,13 @@ from unittest import mock
 import torch
 from torch import Tensor
 
+from sadgs_ns import gsplat_compat
 from sadgs_ns.kernels import TILE_SIZE, projection, triton_switched
 from sadgs_ns.kernels.adam import adam_step, rate_and_scale
 from sadgs_ns.kernels.compositing import rasterize_to_pixels
 from sadgs_ns.kernels.exchange import pack, unpack
 from sadgs_ns.kernels.harmonics import colors_from_harmonics
+from sadgs_ns.kernels.projection_forward import project_forward
 from sadgs_ns.kernels.tiles import intersect_tiles
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.quantization import quantize
@@ -279,9 +281,9 @@ def losses() -> Results:
 
 @contextmanager
 def projected_as(projected: Projection) -> Iterator[None]:
-    """Meanwhile take this in place of what gsplat's projection returns, which needs CUDA."""
+    """Meanwhile take this in place of what the forward projection returns, so that Gaussians of all forms are drawn."""
     results = (projected.radii, projected.means2d, projected.depths, projected.conics)
-    with mock.patch.object(projection.gsplat_compat, "project", lambda *arguments: results):
+    with mock.patch.object(projection, "project_forward", lambda *arguments: results):
         yield
 
 
@@ -303,6 +305,22 @@ def projections() -> Results:
             with projected_as(projected):
                 gradients = with_gradients(random, partial(results, count, **others), inputs)
             found |= named(f"radius per axis {per_axis}, {count} outputs", gradients)
+    return found
+
+
+def forward_projections() -> Results:
+    """Project Gaussians, with one radius and two; what is not drawn has no values."""
+    found: Results = {}
+    for per_axis in (False, True):
+        random = Random(15)
+        world = random_world(random)
+        opacities = random.uniform(0.0, 1.0, N)
+        arguments = (world.means, world.quats, world.scales, opacities, world.viewmats, world.Ks, WIDTH, HEIGHT)
+        with mock.patch.object(gsplat_compat, "RADII_PER_AXIS", per_axis):
+            radii, *others = project_forward(*arguments)
+        seen = gsplat_compat.drawn(radii, others[0])
+        results = {"radii": radii} | {f"output {place}": value[seen] for place, value in enumerate(others)}
+        found |= named(f"radius per axis {per_axis}", results)
     return found
 
 
@@ -437,6 +455,7 @@ KERNELS: dict[str, Callable[[], Results]] = {
     "harmonics": harmonics,
     "losses": losses,
     "projection": projections,
+    "projection_forward": forward_projections,
     "quantization": quantization,
     "screen_gradients": screen_gradients,
     "statistics": statistics,

@@ -101,9 +101,10 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         JSON-ready. Seconds: `import_seconds`, `setup_seconds` (parsing the data and all else that nerfstudio builds),
         `initialization_seconds` (the model from the points), `load_seconds`, `warmup_seconds` and, where the method has
         them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
-        alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (with the near
-        plane of other programs' viewers) and what `coverage_of_views` tells. `curve`, if the job asks for it, has the
-        points of `curve.Curve`, the last one being the finished run; no time contains its evaluations.
+        alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (as other programs'
+        viewers draw) and what `coverage_of_views` tells. `differing_pixels` is what `viewpoints.pixels_that_differ`
+        tells. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished run; no
+        time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
         `peak_gb` is the first device's. The others return nothing.
@@ -223,7 +224,7 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[s
     """Evaluate a trained model on the held-out views; return all of `run_row` but `devices` and `curve`."""
     import torch
 
-    from benchmarks import evaluate
+    from benchmarks import evaluate, viewpoints
 
     pipeline = trainer.pipeline
     datamanager = pipeline.datamanager
@@ -232,6 +233,7 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[s
     views = datamanager.fixed_indices_eval_dataloader
     held_out = evaluate.quality(model, views, evaluate.load_lpips())
     held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
+    differing = viewpoints.pixels_that_differ(model, datamanager.train_dataset.cameras)
     return {
         "iterations": trainer.config.max_num_iterations,
         "views_per_iteration": model.plan.views_per_iteration if hasattr(model, "plan") else 1,
@@ -239,6 +241,7 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[s
         **seconds,
         **held_out,
         **coverage_of_views(datamanager, model),
+        "differing_pixels": differing,
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,
         "train_views": len(datamanager.train_dataset),

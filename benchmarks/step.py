@@ -17,7 +17,7 @@ from torch import Tensor
 
 from benchmarks.evaluate import now
 from benchmarks.table import grid
-from sadgs_ns import kernels
+from sadgs_ns import gsplat_compat, kernels
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.screen_gradients import accumulate_gradients, keep_gradient
@@ -69,6 +69,8 @@ class Step:
             "opacities": torch.logit(uniform(0.05, 0.95, gaussians, 1)),
         }
         self.params = {name: torch.nn.Parameter(value) for name, value in values.items()}
+        opacities = values["opacities"].sigmoid().squeeze(-1)
+        self.activated = values["means"], values["quats"], values["scales"].exp(), opacities
         self.optimizers = {name: FusedAdam([p], lr=1e-6, eps=1e-15) for name, p in self.params.items()}
         self.nonfinite_flag = torch.zeros(1, device=device)
         self.state: dict[str, Any] = empty_state(gaussians, device)
@@ -99,6 +101,16 @@ class Step:
             self.capacity = int(ROOM * sum(info["pair_counts"].wait()))
         self.info = {**info, "viewmats": self.viewmats, "Ks": self.Ks, "structure_tensors": self.structure_tensors}
         return drawn
+
+    @torch.no_grad()
+    def project(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The forward projection alone, of Gaussians that are activated before: our kernel, or gsplat's."""
+        if kernels.use_triton(self.params["means"]):
+            from sadgs_ns.kernels.projection_forward import project_forward as project
+        else:
+            project = gsplat_compat.project
+        means, quats, scales, opacities = self.activated
+        return project(means, quats, scales, opacities, self.viewmats, self.Ks, self.width, self.height)
 
     def forget_gradients(self) -> None:
         """As a step begins."""
@@ -168,6 +180,7 @@ class Command:
                     step = Step(gaussians, self.width, self.height)
                     step()
                     parts = {
+                        "projection, forward": step.project,
                         "rasterize, forward and backward": step.render,
                         "L1 + SSIM + ℓ2 with gradient": step.compare,
                         "one observation of η": step.observe,

@@ -17,7 +17,8 @@ RADII_PER_AXIS = "opacities" in inspect.signature(gsplat.fully_fused_projection)
 """Whether the installed gsplat is 1.5 or newer. Its projection takes opacities and makes radii int32 [C, N, 2]: the
 extents along x and y at which alpha falls below 1/255, at most 3.33 standard deviations. gsplat 1.4 makes radii int32
 [C, N]: three standard deviations along the longer axis. Both are in px, and zero where a Gaussian is not drawn. The
-rest of the package, also its Triton kernels, reads both layouts; `project` must convert a third one of a new gsplat."""
+rest of the package reads both layouts, and our own projections write the one that is named here; `project` must convert
+a third one of a new gsplat."""
 NEAR_PLANE = 0.01  # Depth in world units from which gsplat 1.4 and 1.5, and most viewers of files, draw Gaussians
 FAR_PLANE = 1e10  # Depth in world units up to which gsplat draws Gaussians
 SCREEN_BLUR = 0.3  # What gsplat adds to the diagonal of Σ2D before it inverts it, its `eps2d`, in px²

@@ -28,8 +28,8 @@ PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton"
 _LPIPS_FILE = "alexnet-owt-7be5be79.pth"  # The file in which torchvision keeps the weights of LPIPS's AlexNet
 _DRIVER_FILE = Path("/proc/driver/nvidia/version")  # NVIDIA's driver writes it, but not under WSL
 _NEEDED = (  # A program or library, its names, what needs it, and the remedy
-    ("nvcc", "nvcc", "gsplat compiles with it if its wheel has no CUDA kernels; install the toolkit of torch's CUDA"),
-    ("C compiler", "gcc clang", "Triton and gsplat compile with it; install the packages gcc, g++ and python3-dev"),
+    ("nvcc", "nvcc", "only the backend gsplat needs it, to compile; install the toolkit of torch's CUDA"),
+    ("C compiler", "gcc clang", "Triton compiles with it; install the packages gcc and python3-dev"),
     ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, `ns-process-data` too; install the package ffmpeg"),
     ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
     ("Node.js", "npx", "pages (.html) are written with its npx; install version 22 or newer from nodejs.org"),
@@ -78,7 +78,7 @@ def check_machine() -> Iterator[Finding]:
         found = _find_program(names.split())
         if found is not None:
             yield note(f"{program}: {found}.")
-        elif program == "nvcc":  # The check of gsplat says whether it is needed.
+        elif program == "nvcc":  # The checks of Triton and gsplat say whether it is needed.
             yield note(f"{program} is missing: {use}.")
         else:
             yield warning(f"{program} is missing: {use}.")
@@ -134,15 +134,23 @@ def _check_cuda() -> Iterator[Finding]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         compiles = kernels.available(device)
-    if compiles and kernels.switched_off():
+    if compiles and not kernels.switched_off():
+        yield note("Triton compiles its kernels here, so gsplat's CUDA code and nvcc are not needed.")
+        return
+    if compiles:
         yield warning(f"Training will take twice as long: {kernels.SWITCH} is 0, unset it.")
-    elif compiles:
-        yield note("Triton compiles its kernels here.")
     else:
         causes = "; ".join(str(message.message) for message in caught) or "Triton is not installed or failed before"
         needed = ".".join(map(str, kernels.OLDEST_TRITON))
         remedy = f"install a torch whose Triton is {needed} or newer, a C compiler and Python's headers"
         yield warning(f"Training will take twice as long ({causes}): {remedy}.")
+    yield from _check_gsplat()
+
+
+def _check_gsplat() -> Iterator[Finding]:
+    """Check gsplat's CUDA kernels, which draw where Triton's do not; it may compile them for minutes."""
+    import torch
+
     try:
         from sadgs_ns import gsplat_compat
 

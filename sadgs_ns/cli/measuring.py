@@ -16,7 +16,7 @@ from sadgs_ns.training.run.deferred_imports import import_nerfstudio
 import_nerfstudio()  # It precedes what imports nerfstudio, and takes half the time.
 
 from sadgs_ns.cli.inspection import load_run  # noqa: E402
-from sadgs_ns.cli.splat_file import draw, read_splat  # noqa: E402
+from sadgs_ns.cli.splat_file import draw_with_opacity, read_splat  # noqa: E402
 from sadgs_ns.errors import InputError  # noqa: E402
 from sadgs_ns.events import progress  # noqa: E402
 from sadgs_ns.training.pipeline import SadgsPipeline  # noqa: E402
@@ -25,7 +25,8 @@ STAGE = "views"
 _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4}
 
 Measures = dict[str, float]
-"""`psnr` in dB and `ssim` of a view, and `lpips` if its weights could be loaded."""
+"""`psnr` in dB and `ssim` of a view, and `lpips` if its weights could be loaded; with `gain_` before each name those
+of a rendering at the photo's exposure, if training used gains."""
 
 
 @torch.no_grad()
@@ -56,9 +57,10 @@ def measure(run: Path, data: Path, file: Path) -> list[str]:
         progress(STAGE, index, len(views))
         camera, batch = views[index]
         outputs = model.get_outputs_for_camera(camera)
-        of_run.append(_measure_view(pipeline, outputs["rgb"], batch))
-        drawn = draw(splat, model.pinhole(camera), model.background, model.config.backend)
-        of_file.append(_measure_view(pipeline, drawn[0], batch))
+        of_run.append(_measure_view(pipeline, outputs["rgb"], outputs["accumulation"], batch))
+        pinhole = model.pinhole(camera)
+        drawn, alpha = draw_with_opacity(splat, pinhole, model.background, model.config.backend)
+        of_file.append(_measure_view(pipeline, drawn[0], alpha[0], batch))
     return describe(names, of_run, of_file, file.name)
 
 
@@ -71,10 +73,10 @@ def _names_of_views(pipeline: SadgsPipeline) -> list[str]:
     return [os.path.relpath(path, common) for path in held_out]
 
 
-def _measure_view(pipeline: SadgsPipeline, drawn: Tensor, batch: dict[str, Any]) -> Measures:
-    """Compare a drawn view, [H, W, 3] in [0, 1], with its photo."""
+def _measure_view(pipeline: SadgsPipeline, drawn: Tensor, alpha: Tensor, batch: dict[str, Any]) -> Measures:
+    """Compare a drawn view, [H, W, 3] in [0, 1], and its opacity [H, W, 1] with its photo."""
     model = pipeline.model
-    outputs = {"rgb": drawn, "background": model.background.expand(drawn.shape)}
+    outputs = {"rgb": drawn, "accumulation": alpha, "background": model.background.expand(drawn.shape)}
     measures, _ = model.get_image_metrics_and_images(outputs, batch)
     return measures
 
@@ -89,6 +91,9 @@ def describe(names: Sequence[str], of_run: Sequence[Measures], of_file: Sequence
         file: The file's name.
     """
     sentences = [f"run: {_means(of_run)}", f"{file}: {_means(of_file)}"]
+    if "gain_psnr" in of_run[0]:
+        sentences.append(f"run, at each photo's exposure: {_means(of_run, 'gain_')}")
+        sentences.append(f"{file}, at each photo's exposure: {_means(of_file, 'gain_')}")
     if "lpips" not in of_run[0]:
         sentences.append("LPIPS is left out, because its AlexNet weights could not be loaded")
     psnr, worst = min((measures["psnr"], name) for name, measures in zip(names, of_file, strict=True))
@@ -99,11 +104,11 @@ def describe(names: Sequence[str], of_run: Sequence[Measures], of_file: Sequence
     return sentences
 
 
-def _means(measures: Sequence[Measures]) -> str:
-    """Return the means of those measures that the views have."""
+def _means(measures: Sequence[Measures], prefix: str = "") -> str:
+    """Return the means of those measures that the views have, whose names begin with the prefix."""
     parts = []
     for name, digits in _DIGITS.items():
-        if name in measures[0]:
-            mean = statistics.fmean(of_view[name] for of_view in measures)
+        if prefix + name in measures[0]:
+            mean = statistics.fmean(of_view[prefix + name] for of_view in measures)
             parts.append(f"{name.upper()} {mean:.{digits}f}")
     return ", ".join(parts)

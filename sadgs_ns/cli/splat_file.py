@@ -52,8 +52,16 @@ def draw(
     Returns:
         Colours in [0, 1]. [C, height, width, 3]
     """
+    colors, _ = draw_with_opacity(splat, cameras, background, backend)
+    return colors
+
+
+def draw_with_opacity(
+    splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draw a splat as `draw`, and return its accumulated opacity [C, height, width, 1], too."""
     options = RenderOptions(sh_degree=splat.degree, backend=backend)
     colors, alphas, _ = rasterize(splat.gaussians, cameras, options)
     if background is not None:
         colors = colors + (1 - alphas) * background
-    return colors.clamp(0, 1)
+    return colors.clamp(0, 1), alphas

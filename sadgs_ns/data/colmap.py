@@ -10,6 +10,7 @@ import contextlib
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ CAMERA_PARAMETERS = {
 """Number of parameters of each of COLMAP's camera models, in the order of the models' ids."""
 
 Points = tuple[NDArray[np.float64], NDArray[np.uint8]]  # Positions [P, 3] and colours in 0 … 255 [P, 3]
+Tracks = tuple[NDArray[np.int64], NDArray[np.int64]]  # Ids of images [K], and which point each sees, from 0 [K]
 Pose = tuple[str, int, NDArray[np.float64]]
 """An image's name, its camera's id, and the wxyz quaternion and translation from world to camera. [7]"""
 
@@ -90,6 +92,7 @@ _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<iiQQ")
 _POSE = struct.Struct("<i7di")
 _POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track", "<u8")])
+_TRACK = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 
 
 def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
@@ -106,32 +109,48 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield camera_id, Camera(model, width, height, params)
 
 
-def _read_binary_poses(path: Path) -> Iterator[Pose]:
+def _read_binary_poses(path: Path) -> Iterator[tuple[int, Pose]]:
     file = _Binary(path)
     for _ in range(file.count()):
-        _, *pose, camera_id = file.take(_POSE)
+        image_id, *pose, camera_id = file.take(_POSE)
         name = file.text()
         keypoints = file.count()
         file.skip(24 * keypoints)  # The keypoints are not needed.
-        yield name, camera_id, np.array(pose)
+        yield image_id, (name, camera_id, np.array(pose))
 
 
-def _read_binary_points(path: Path) -> Points:
+def _split_binary_points(path: Path) -> tuple[list[bytes], list[bytes]]:
+    """Return the record of each point, and the bytes of its track."""
     file = _Binary(path)
     count = file.count()
     content = file.content
     start = file.offset
     records = []
+    tracks = []
     for _ in range(count):  # There may be millions, so no function of this module is called in here.
-        record = content[start : start + _POINT.itemsize]
+        end = start + _POINT.itemsize
+        record = content[start:end]
         records.append(record)
         track_length = int.from_bytes(record[-8:], "little")
-        start += _POINT.itemsize + 8 * track_length  # The track follows the record.
+        start = end + 8 * track_length  # The track follows the record.
         if start > len(content):
             break
+        tracks.append(content[end:start])
     file.skip(start - file.offset)  # This raises the error if the file ends too early.
+    return records, tracks
+
+
+def _read_binary_points(path: Path) -> Points:
+    records, _ = _split_binary_points(path)
     points = np.frombuffer(b"".join(records), _POINT)
     return points["position"], points["color"].copy()
+
+
+def _read_binary_tracks(path: Path) -> Tracks:
+    _, tracks = _split_binary_points(path)
+    lengths = [len(track) // _TRACK.itemsize for track in tracks]
+    images = np.frombuffer(b"".join(tracks), _TRACK)["image"]
+    return images.astype(np.int64), np.repeat(np.arange(len(tracks)), lengths)
 
 
 def _read_text(path: Path, minimum: int, numbered: bool = True) -> Iterator[tuple[list[str], Iterator[str]]]:
@@ -162,7 +181,7 @@ def _read_text_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield int(fields[0]), Camera(fields[1], int(fields[2]), int(fields[3]), params)
 
 
-def _read_text_poses(path: Path) -> Iterator[Pose]:
+def _read_text_poses(path: Path) -> Iterator[tuple[int, Pose]]:
     for fields, following in _read_text(path, 10):
         if len(fields) > 10:
             name = " ".join(fields[9:])
@@ -173,7 +192,7 @@ def _read_text_poses(path: Path) -> Iterator[Pose]:
         if len(keypoints) % 3 != 0:  # Each has x, y and the number of its point.
             problem = f"{path}: the line after image {fields[9]!r} does not hold its keypoints"
             raise InputError(f"{problem}: each image needs such a line, which may be empty.")
-        yield fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64)
+        yield int(fields[0]), (fields[9], int(fields[8]), np.array(fields[1:8], dtype=np.float64))
 
 
 def _read_text_points(path: Path) -> Points:
@@ -183,6 +202,13 @@ def _read_text_points(path: Path) -> Points:
     if not ((colors >= 0) & (colors <= 255)).all():
         raise ValueError("a colour is not in 0 … 255")
     return positions, colors.astype(np.uint8)
+
+
+def _read_text_tracks(path: Path) -> Tracks:
+    tracks = [fields[8::2] for fields, _ in _read_text(path, 8, numbered=False)]
+    lengths = [len(track) for track in tracks]
+    images = np.array(list(chain.from_iterable(tracks)), np.int64)
+    return images, np.repeat(np.arange(len(tracks)), lengths)
 
 
 @contextlib.contextmanager
@@ -222,6 +248,15 @@ def read_cameras(path: Path) -> dict[int, Camera]:
 
 def read_poses(path: Path) -> list[Pose]:
     """Return the poses of an `images.bin` or `images.txt`; raises as `read_cameras`."""
+    return [pose for _, pose in _read_numbered_poses(path)]
+
+
+def read_image_ids(path: Path) -> dict[int, str]:
+    """Return the images' names of an `images.bin` or `images.txt` by their ids; raises as `read_cameras`."""
+    return {image_id: name for image_id, (name, _, _) in _read_numbered_poses(path)}
+
+
+def _read_numbered_poses(path: Path) -> list[tuple[int, Pose]]:
     with _errors_as_sentences(path):
         if path.suffix == ".bin":
             return list(_read_binary_poses(path))
@@ -245,3 +280,16 @@ def read_points(path: Path) -> Points:
     readers = {".bin": _read_binary_points, ".txt": _read_text_points, ".ply": ply.read_points}
     with _errors_as_sentences(path):
         return readers[path.suffix](path)
+
+
+def read_tracks(path: Path) -> Tracks:
+    """Return which images see which points of a `points3D.bin` or `.txt`; raises as `read_cameras`.
+
+    The points are numbered in the order of `read_points`. Other files have no tracks.
+    """
+    with _errors_as_sentences(path):
+        if path.suffix == ".bin":
+            return _read_binary_tracks(path)
+        if path.suffix == ".txt":
+            return _read_text_tracks(path)
+    return np.zeros(0, np.int64), np.zeros(0, np.int64)

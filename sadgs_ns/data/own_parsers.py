@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.images import mask_name
-from sadgs_ns.data.run_frame import centre_poses, points_in_the_run, undo_centring
+from sadgs_ns.data.run_frame import POINTS_FILE, centre_poses, points_in_the_run, undo_centring
 from sadgs_ns.data.transforms import blender_images, read_blender
 from sadgs_ns.data.transforms_parser import TransformsParser, scene_box
 
@@ -104,7 +104,8 @@ class ColmapParser(ColmapDataParser):
             matches = super()._load_3D_points(colmap_path, transform_matrix, scale_factor)
         source = colmap.points_file(colmap_path) or colmap_path / "points3D.bin"
         positions, colors = colmap.read_points(source)
-        return matches | points_in_the_run(positions - self._middle, colors, transform_matrix, scale_factor)
+        placed = points_in_the_run(positions - self._middle, colors, transform_matrix, scale_factor)
+        return matches | placed | {POINTS_FILE: source}  # type: ignore[return-value]
 
 
 OWN: dict[type, type] = {

@@ -15,6 +15,8 @@ from torch import Tensor
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
 
+POINTS_FILE = "points3D_file"
+"""Key of a parser's metadata: the file of a COLMAP reconstruction from which all its points were read, in its order."""
 _FAR = 10.0  # Poses farther from the origin than so many of their extents are centred.
 
 

@@ -25,7 +25,14 @@ from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, transforms_path
-from sadgs_ns.data.run_frame import Centring, centre_poses, move_to_fixed_frame, points_in_the_run, undo_centring
+from sadgs_ns.data.run_frame import (
+    POINTS_FILE,
+    Centring,
+    centre_poses,
+    move_to_fixed_frame,
+    points_in_the_run,
+    undo_centring,
+)
 from sadgs_ns.data.transforms import DISTORTION, read_transforms
 
 _INTRINSICS = {
@@ -219,7 +226,7 @@ def _distortion(frame: dict[str, Any]) -> Tensor:
 
 def _read_points(
     meta: dict[str, Any], folder: Path, centring: Centring, transform: Tensor, from_data: Tensor, scale: float
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """Return the points of the file's PLY, or of a COLMAP model beside it, in the run's frame; none if there are none.
 
     A PLY is in the frame of the poses, of which `transform` [3, 4] maps to the run's frame, and a model is in that of
@@ -239,4 +246,4 @@ def _read_points(
     if source is None:
         return {}
     positions, colors = colmap.read_points(source)
-    return points_in_the_run(positions - centring.of_data, colors, from_data, scale)
+    return points_in_the_run(positions - centring.of_data, colors, from_data, scale) | {POINTS_FILE: source}

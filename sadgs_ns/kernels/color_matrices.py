@@ -35,14 +35,20 @@ def _correct(render, alpha, matrices, corrected, n, LANES: tl.constexpr):
 
 
 @triton.jit(do_not_specialize=["n"])
-def _correct_backward(render, alpha, matrices, v_corrected, v_render, v_alpha, sums, n, LANES: tl.constexpr):
-    """Write the gradients by colours and opacities of one view's pixels, and sum those by its matrix in parts."""
+def _correct_backward(
+    render, alpha, matrices, v_corrected, v_render, v_alpha, sums, n, LEARNED: tl.constexpr, LANES: tl.constexpr
+):
+    """Write the gradients by colours and opacities of one view's pixels, and sum those by its matrix in parts.
+
+    Without LEARNED, the matrix has no gradient, and neither render, alpha nor sums are read or written.
+    """
     view = tl.program_id(1).to(tl.int64)
     i = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = i < n
     pixel = view * n + i
-    opacity = tl.load(alpha + pixel, exists, 0.0)
-    r, g, b = load3(render, 3 * pixel, exists)
+    if LEARNED:
+        opacity = tl.load(alpha + pixel, exists, 0.0)
+        r, g, b = load3(render, 3 * pixel, exists)
     v_r = tl.zeros([LANES], tl.float32)
     v_g, v_b, v_opacity = v_r, v_r, v_r
     part = sums + 12 * (view * tl.num_programs(0) + tl.program_id(0))
@@ -53,8 +59,9 @@ def _correct_backward(render, alpha, matrices, v_corrected, v_render, v_alpha, s
         v_g += v * tl.load(row + 1)
         v_b += v * tl.load(row + 2)
         v_opacity += v * tl.load(row + 3)
-        store3(part, 4 * k, tl.sum(v * r), tl.sum(v * g), tl.sum(v * b), True)
-        tl.store(part + 4 * k + 3, tl.sum(v * opacity))
+        if LEARNED:
+            store3(part, 4 * k, tl.sum(v * r), tl.sum(v * g), tl.sum(v * b), True)
+            tl.store(part + 4 * k + 3, tl.sum(v * opacity))
     store3(v_render, 3 * pixel, v_r, v_g, v_b, exists)
     tl.store(v_alpha + pixel, v_opacity, exists)
 
@@ -71,15 +78,22 @@ class _CorrectColors(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_corrected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def backward(ctx: Any, v_corrected: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         render, alpha, matrices = ctx.saved_tensors
         views, height, width, _ = render.shape
         grid = (cdiv(height * width, _LANES), views)
         v_render, v_alpha = torch.empty_like(render), torch.empty_like(alpha)
-        sums = render.new_empty((views, grid[0], 3, 4))
+        is_learned = ctx.needs_input_grad[2]
+        parts = 1
+        if is_learned:
+            parts = grid[0]
+        sums = render.new_empty((views, parts, 3, 4))
         _correct_backward[grid](
-            render, alpha, matrices, v_corrected.contiguous(), v_render, v_alpha, sums, height * width, _LANES
-        )
+            render, alpha, matrices, v_corrected.contiguous(), v_render, v_alpha, sums, height * width, is_learned,
+            _LANES,
+        )  # fmt: skip
+        if not is_learned:
+            return v_render, v_alpha, None
         return v_render, v_alpha, sums.sum(dim=1)
 
 

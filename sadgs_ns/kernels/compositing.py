@@ -1,4 +1,4 @@
-"""gsplat's alpha compositing of three channels in kernels of our own; backward, tensor cores sum over the pixels.
+"""gsplat's alpha compositing in kernels of our own for three channels; backward, tensor cores sum over the pixels.
 
 gsplat's kernel gives each pixel a thread, which goes through the tile's list Gaussian by Gaussian. Here a warp draws a
 tile of 64 pixels in blocks [Gaussians, pixels]: a thread holds all Gaussians of a batch for its two pixels, so that
@@ -420,3 +420,26 @@ def rasterize_to_pixels(
         means2d, conics.contiguous(), colors.contiguous(), opacities.contiguous(),
         width, height, isect_offsets, flatten_ids, absgrad,
     )  # fmt: skip
+
+
+def rasterize_channels(
+    means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, width: int, height: int,
+    isect_offsets: Tensor, flatten_ids: Tensor,
+) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Composite any number of channels [C, N, D], three at a time; otherwise as `rasterize_to_pixels` without absgrad.
+
+    Returns:
+        Colours [C, height, width, D], and alphas [C, height, width, 1].
+    """
+    num_channels = colors.shape[-1]
+    missing = -num_channels % 3
+    padded = torch.nn.functional.pad(colors, (0, missing))
+    renders = []
+    alphas = []
+    for three in padded.split(3, dim=-1):
+        render, alpha = rasterize_to_pixels(
+            means2d, conics, three, opacities, width, height, isect_offsets, flatten_ids, False
+        )  # fmt: skip
+        renders.append(render)
+        alphas.append(alpha)
+    return torch.cat(renders, dim=-1)[..., :num_channels], alphas[0]

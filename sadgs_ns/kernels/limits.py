@@ -1,6 +1,6 @@
 """The largest sizes that the kernels can address, and their checks.
 
-Addresses have 64 bits, except where that would cost registers or where gsplat's own kernels in between have 32.
+Addresses have 64 bits, except where that would cost registers.
 """
 
 from __future__ import annotations

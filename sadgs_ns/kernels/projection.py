@@ -1,4 +1,4 @@
-"""gsplat's projection with a backward pass of our own, in one launch.
+"""The projection, differentiable by a backward pass in one launch; `projection_forward` is the forward pass.
 
 gsplat's takes eight: it fills gradients with zeros, copies those that compositing gives it as parts of rows, and adds
 with atomic operations. Here each Gaussian's gradients are summed over the views in registers, and what else depends on
@@ -15,10 +15,10 @@ import triton.language as tl
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, rotation, store3
+from sadgs_ns.kernels.projection_forward import project_forward
+from sadgs_ns.kernels.shared import clamped, drawn, equally_spaced_rows, load3, rotation, store3
 
 _LANES = 128  # Gaussians that one program handles
 
@@ -26,13 +26,6 @@ _LANES = 128  # Gaussians that one program handles
 @triton.jit
 def _symmetric_times(xx, xy, xz, yy, yz, zz, x, y, z):
     return xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
-
-
-@triton.jit
-def _clamped(ratio, focal, centre, size):
-    """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
-    margin = 0.15 * size / focal
-    return tl.minimum(tl.maximum(ratio, -(centre / focal + margin)), (size - centre) / focal + margin)
 
 
 @triton.jit
@@ -99,7 +92,7 @@ def _project_backward(
         h00, h01, h11 = -(top * a + right * b), -(top * b + right * c), -(left * b + bottom * c)
 
         # Σ2D = T Σ Tᵀ with T = J W, where W is the camera's rotation and J the Jacobian [2, 3] of the projection.
-        slope_x, slope_y = _clamped(x * inverse, fx, cx, width), _clamped(y * inverse, fy, cy, height)
+        slope_x, slope_y = clamped(x * inverse, fx, cx, width), clamped(y * inverse, fy, cy, height)
         jx, jy = fx * inverse, fy * inverse
         t00, t01, t02 = jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22)
         t10, t11, t12 = jy * (w10 - slope_y * w20), jy * (w11 - slope_y * w21), jy * (w12 - slope_y * w22)
@@ -168,10 +161,9 @@ class _Project(torch.autograd.Function):
         ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
         width: int, height: int, near_plane: float,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
-        radii, means2d, depths, conics = gsplat_compat.project(
+        radii, means2d, depths, conics = project_forward(
             means, quats, scales, opacities, viewmats, Ks, width, height, near_plane
         )
-        radii = radii.contiguous()
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)  # torch would fill gradients with zeros where nothing depends on an output
         ctx.save_for_backward(means, quats, scales, viewmats, Ks, radii, means2d, conics)

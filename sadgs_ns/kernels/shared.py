@@ -44,6 +44,13 @@ def rotation(w, x, y, z):
     )  # fmt: skip
 
 
+@triton.jit
+def clamped(ratio, focal, centre, size):
+    """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
+    margin = 0.15 * size / focal
+    return tl.minimum(tl.maximum(ratio, -(centre / focal + margin)), (size - centre) / focal + margin)
+
+
 def equally_spaced_rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
     """Return a gradient [C, N, D] whose rows are equally far apart, and how many numbers; zeros where there is none.
 

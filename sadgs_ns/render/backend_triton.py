@@ -1,19 +1,21 @@
-"""Our Triton kernels behind `project` and `composite`, around the forward pass of gsplat's projection."""
+"""Our Triton kernels behind `project` and `composite`."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import gsplat
+import torch
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
+from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import TILE_SIZE, compositing
 from sadgs_ns.kernels import projection as kernels_projection
 from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
-from sadgs_ns.render.backend_gsplat import colors_in_views, opacities_in_views
+from sadgs_ns.render.backend_gsplat import opacities_in_views
+from sadgs_ns.render.ewa import spherical_harmonics
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
@@ -45,8 +47,29 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     if isinstance(colors, tuple) and degree is not None and degree <= MAX_DEGREE and not differentiates_cameras:
         colors = colors_from_harmonics(degree, gaussians.means, *colors, viewmats, radii)
     else:
-        colors = colors_in_views(gaussians, viewmats, radii, means2d, degree)
+        colors = _colors_in_views(gaussians, viewmats, degree)
     return Projected(radii, means2d, depths, conics, opacities, colors, width, height, tiles)
+
+
+def _colors_in_views(gaussians: Gaussians, viewmats: Tensor, sh_degree: int | None) -> Tensor:
+    """Return features once for each view, or in torch the colours of coefficients that our kernel does not take.
+
+    [C, N, D]
+    """
+    num_views = len(viewmats)
+    colors = gaussians.colors
+    if isinstance(colors, tuple):
+        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    if sh_degree is None:
+        return colors.expand(num_views, -1, -1)
+    if sh_degree > MAX_DEGREE:
+        raise InputError(
+            f"The backend triton draws spherical harmonics up to degree {MAX_DEGREE}, and these have {sh_degree}."
+        )
+    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
+    directions = gaussians.means - positions
+    coefficients = colors.expand(num_views, -1, -1, -1)
+    return torch.clamp_min(spherical_harmonics(sh_degree, directions, coefficients) + 0.5, 0.0)
 
 
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -55,17 +78,18 @@ def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Ten
     With `options.tile_capacity`, the tile lists have one more row of tiles than the image (`PendingTiles.lists`).
     """
     radii, means2d, depths, conics, opacities, colors, width, height, tiles = projected
+    if options.absgrad and colors.shape[-1] != 3:
+        problem = f"The backend triton sums absolute gradients of 3 channels, and these are {colors.shape[-1]}"
+        raise InputError(f"{problem}: render depths or features without absgrad, or take the backend gsplat.")
     if tiles is None:
         check_gaussians(*depths.shape)
         check_pixels(len(depths), height, width)
         tiles = intersect_tiles(means2d, radii, depths, conics, opacities, width, height, TILE_SIZE)
     splats = (means2d, conics, colors, opacities, width, height)
+    starts, flatten_ids, overflowed = tiles.lists(options.tile_capacity)
     if colors.shape[-1] == 3:
-        starts, flatten_ids, overflowed = tiles.lists(options.tile_capacity)
         renders, alphas = compositing.rasterize_to_pixels(*splats, starts, flatten_ids, options.absgrad)
     else:
-        # gsplat's backward kernel would read unused places, too, one after the other in a single block.
-        starts, flatten_ids, overflowed = tiles.lists(None)
-        renders, alphas = gsplat.rasterize_to_pixels(*splats, TILE_SIZE, starts, flatten_ids, absgrad=options.absgrad)
+        renders, alphas = compositing.rasterize_channels(*splats, starts, flatten_ids)
     lists = {"flatten_ids": flatten_ids, "pair_counts": tiles.pair_counts, "overflowed": overflowed}
     return renders, alphas, lists

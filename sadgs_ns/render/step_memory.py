@@ -1,6 +1,6 @@
 """How much memory a training step takes on CUDA, and how many Gaussians can be added before the next one.
 
-The bytes are counted from the code that allocates them: `render.backend_triton` and gsplat's `fully_fused_projection`,
+The bytes are counted from the code that allocates them: `render.backend_triton`, `kernels.projection_forward`,
 `kernels.tiles`, `kernels.losses` and `kernels.compositing`; `tests/benchmarks/test_step.py` measures real peaks.
 
 A step is largest in one of three phases: while the tile lists are sorted, in the loss, and in the backward pass of

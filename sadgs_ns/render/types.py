@@ -55,7 +55,8 @@ class RenderOptions:
     expected_depth: bool = False
     """Whether the expected depth is rendered as one more channel."""
     absgrad: bool = False
-    """Whether `backward` sets `absgrad` of the projected centres, the sum of their absolute gradients. [C, N, 2]"""
+    """Whether `backward` sets `absgrad` of the projected centres, the sum of their absolute gradients. [C, N, 2]
+    The Triton backend does so for three channels, without expected depth."""
     tile_capacity: int | None = None
     """Number of pairs of a Gaussian and a tile, in all views, for which the Triton backend makes room; None waits for
     the exact number. If there are more, nothing is drawn, no gradient flows and all radii are 0."""

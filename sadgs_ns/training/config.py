@@ -67,7 +67,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Whether and how the cameras' poses are refined in training."""
     backend: BackendName = "auto"
     """Which code draws: auto takes Triton kernels where they work, gsplat on other CUDA devices, and torch elsewhere.
-    gsplat trains on one GPU, without CUDA graphs."""
+    gsplat trains on one GPU, without CUDA graphs, and alone needs nvcc."""
     background_color: Literal["black", "white"] = "black"
     """Colour behind the Gaussians."""
     random_init: bool = False
@@ -106,7 +106,10 @@ class SadgsModelConfig(InstantiateConfig):
     A longer one that lies beside a view can cover it with haze; 0 sets no limit."""
     color_model: Literal["none", "affine"] = "none"
     """Whether a colour matrix of each training photo is learned; held-out views are rendered without one."""
-    color_corrected_metrics: bool = False
+    exposure: Literal["auto", "off"] = "auto"
+    """Whether photos are compared with renderings at their own exposure if exposure varies between them.
+    Their gains come from the colours of common SfM points, or from EXIF. The splat has the median exposure."""
+    color_corrected_metrics: Suppress[bool] = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
 
     def check(self) -> None:

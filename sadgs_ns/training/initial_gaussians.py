@@ -74,15 +74,21 @@ def spheres(
 ) -> dict[str, Tensor]:
     """Return the parameters of spheres with random rotations."""
     number = len(means)
-    if sh_degree > 0:
-        features_dc = RGB2SH(colors)
-    else:
-        features_dc = torch.logit(colors, eps=1e-4)
     return {
         "means": means,
         "scales": scales.log()[:, None].repeat(1, 3),
         "quats": random_quat_tensor(number),
-        "features_dc": features_dc,
+        "features_dc": color_features(colors, sh_degree),
         "features_rest": torch.zeros((number, num_sh_bases(sh_degree) - 1, 3)),
         "opacities": torch.logit(torch.as_tensor(opacities).expand(number))[:, None],
     }
+
+
+def color_features(
+    colors: Tensor,  # [P, 3] in [0, 1]
+    sh_degree: int,
+) -> Tensor:
+    """Return the parameters features_dc of Gaussians that have these colours from all sides. [P, 3]"""
+    if sh_degree > 0:
+        return RGB2SH(colors)
+    return torch.logit(colors, eps=1e-4)

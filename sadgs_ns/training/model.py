@@ -14,6 +14,7 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
@@ -22,6 +23,7 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
 from sadgs_ns.geometry.extents import camera_extent
 from sadgs_ns.geometry.initialization import neighbour_scales
+from sadgs_ns.geometry.point_colors import apply_gains, srgb_gains
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
 from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.method.running_strategy import RunningStrategy
@@ -33,10 +35,12 @@ from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
-from sadgs_ns.training.initial_gaussians import initial_gaussians, spheres
+from sadgs_ns.training.exposure_table import ExposureTable
+from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
 from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
+from sadgs_ns.training.step.color_matrices import anchored
 from sadgs_ns.training.step.parameter_average import RunningMean
 
 CAMERA_CLEARANCE = 2.0
@@ -54,6 +58,7 @@ class SadgsModel(SplatfactoModel):
     strategy: RunningStrategy
     plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
+    gain_matrices: Tensor | None
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
@@ -78,8 +83,11 @@ class SadgsModel(SplatfactoModel):
         self.world = World()
         if config.color_model == "affine":
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
-            # An index that is made in a step must be copied to the device in that step.
-            self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
+        self.exposure: ExposureTable | None = None  # Stored with the extra state, as its size is that of the data
+        self.gain_of_held_out: Callable[[Mapping[str, Any]], Tensor | None] = lambda data: None
+        self.register_buffer("gain_matrices", None, persistent=False)  # Those of `exposure`. [V, 3, 4]
+        # An index that is made in a step must be copied to the device in that step.
+        self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
     def set_cameras(self, cameras: Cameras) -> None:
         """Set the extent and drop Gaussians that are too close to a camera; call before optimizers are made."""
@@ -198,11 +206,61 @@ class SadgsModel(SplatfactoModel):
         self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
         return groups  # type: ignore[return-value]
 
+    @property
+    def may_use_gains(self) -> bool:
+        """Whether photos may have gains; learned colour matrices are another answer to the same question."""
+        return self.config.exposure == "auto" and self.config.color_model == "none"
+
+    def set_exposure(self, table: ExposureTable | None) -> None:
+        """From now on, compare training photos with renderings at their exposure, or with plain ones if it is None."""
+        self.exposure = table
+        self.gain_matrices = None
+        if table is not None:
+            self.gain_matrices = table.matrices().to(self.device)
+
+    def color_points(self, stops: Tensor) -> None:
+        """Bring the Gaussians of SfM points to the median exposure; call before training.
+
+        The points' colours are means over photos, and `stops` [P, 3] are log₂ of these photos' mean gains.
+        """
+        if self.seed_points is None:
+            return
+        positions, colors = self.seed_points
+        real = (~self.synthetic).nonzero()[:, 0].to(self.device)
+        points = positions.float().cpu()
+        known = points.isfinite().all(dim=1)
+        if not known.any() or not len(real):
+            return
+        # Each of these Gaussians begins at a point, and some points have none.
+        distances, nearest = KDTree(points[known]).query(self.means.detach()[real].cpu())
+        found = torch.from_numpy(distances == 0)
+        rows = torch.from_numpy(nearest)[found]
+        to_median = 1 / srgb_gains(stops[known][rows])
+        at_median = apply_gains(colors[known][rows].cpu() / 255, to_median).clamp(0, 1)
+        features = color_features(at_median, self.config.sh_degree).to(self.gauss_params["features_dc"])
+        self.gauss_params["features_dc"].data[real[found.to(self.device)]] = features
+
+    @property
+    def has_view_colors(self) -> bool:
+        """Whether renderings of training views are changed by a colour matrix of each view."""
+        return self.color_matrices is not None or self.gain_matrices is not None
+
     def view_ids(self, cam_indices: Sequence[int]) -> Tensor | None:
         """Return indices of C views on the device, int64 [C], without waiting; None without colour matrices."""
-        if self.color_matrices is None:
+        if not self.has_view_colors:
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
+
+    def view_matrices(
+        self,
+        params: Mapping[str, Tensor],  # Of `trained_params`
+        view_ids: Tensor,  # int64 [C]
+    ) -> Tensor:
+        """Return the colour matrices of C training views, learned or of their exposure. [C, 3, 4]"""
+        if self.color_matrices is not None:
+            return anchored(params["color_matrices"], view_ids)
+        assert self.gain_matrices is not None  # Otherwise `view_ids` returns none.
+        return self.gain_matrices.index_select(0, view_ids)
 
     def shown_rows(self, chosen: Tensor | None = None) -> Tensor | None:
         """Return which Gaussians are drawn: the chosen ones that lie in the viewer's crop box. bool [N]
@@ -428,19 +486,48 @@ class SadgsModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view."""
+        """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view.
+
+        If training used gains, `gain_psnr` and so on compare the photo with a rendering at its exposure.
+        """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        for name in ("lpips", "cc_lpips"):
+        gained = self.at_exposure_of_photo(outputs, batch)
+        if gained is not None:
+            photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+            predicted = gained.movedim(-1, 0)[None]
+            truth = photo.movedim(-1, 0)[None]
+            metrics["gain_psnr"] = float(self.psnr(truth, predicted))
+            metrics["gain_ssim"] = float(self.ssim(truth, predicted))
+            metrics["gain_lpips"] = float(self.lpips(truth, predicted))
+        for name in ("lpips", "cc_lpips", "gain_lpips"):
             if name in metrics and math.isnan(metrics[name]):
                 del metrics[name]
         return metrics, images
 
+    def at_exposure_of_photo(self, outputs: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor | None:
+        """Return a held-out view's rendering with its photo's gain, or None if training used no gains. [H, W, 3]
+
+        The photo's gain comes from points' colours, not from the rendering.
+        """
+        if self.exposure is None:
+            return None
+        gains = self.gain_of_held_out(batch)
+        if gains is None:
+            return None
+        alpha = outputs["accumulation"]
+        behind = (1 - alpha) * outputs["background"]
+        gained = apply_gains(outputs["rgb"] - behind, gains.to(alpha), alpha)
+        return (gained + behind).clamp(0.0, 1.0)
+
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the step, the strategy's state and the mean of the parameters so far."""
+        """Return the step, the strategy's state, the mean of the parameters so far, and the photos' gains."""
         state = dict(self.strategy_state)
         if "camera_paths" in state:
             state["camera_paths"] = asdict(state["camera_paths"])
-        return {"step": self.step, "strategy_state": state, "average": self.average.state_dict()}
+        extra = {"step": self.step, "strategy_state": state, "average": self.average.state_dict()}
+        if self.exposure is not None:
+            extra["exposure"] = self.exposure.state_dict()
+        return extra
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved."""
@@ -450,6 +537,7 @@ class SadgsModel(SplatfactoModel):
         if paths is not None:
             self.strategy_state["camera_paths"] = CameraPaths(**self._on_device(paths))
         self.average.load_state_dict(state["average"], self.device)
+        self.set_exposure(ExposureTable.of(state.get("exposure")))
 
     def _on_device(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Return a dictionary with its tensors on the model's device, and with all other values as they are."""

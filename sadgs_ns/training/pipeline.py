@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import asdict
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -17,7 +19,11 @@ from torch import Tensor
 
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.data.checks.capture import findings_of
+from sadgs_ns.data.exif_exposure import exposure_stops, exposures_of
+from sadgs_ns.data.run_frame import POINTS_FILE
 from sadgs_ns.errors import InputError
+from sadgs_ns.geometry.exposure import gains_of_others
+from sadgs_ns.geometry.point_colors import srgb_gains
 from sadgs_ns.gsplat_compat import FAR_PLANE
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
@@ -25,6 +31,7 @@ from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.run.memory_plan import choose_image_storage
+from sadgs_ns.training.run.point_observations import PointObservations
 from sadgs_ns.training.run.progress import note, warn
 from sadgs_ns.training.run.run_plan import RunPlan, unknown_fields
 from sadgs_ns.training.step import nonfinite
@@ -89,6 +96,7 @@ class SadgsPipeline(VanillaPipeline):
         self.structure = StructurePanel(shown_run)
         self.cleaning = CleaningPanel(shown_run)
         self.model.viewer_outputs = self._viewer_outputs
+        self.model.gain_of_held_out = self._gain_of_held_out
 
     def _store_images(self) -> None:
         """Keep the images where the memory has room for them, and print it if that is not where the options say."""
@@ -106,6 +114,52 @@ class SadgsPipeline(VanillaPipeline):
                 f"The images were put on {behind_images}, the Gaussians lie on {behind_gaussians}: consider "
                 f"--pipeline.model.background-color {behind_images}."
             )
+
+    def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
+        """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
+
+        It loads the images' cameras, so call it after `decide_near_plane`. Raises as `PointObservations`.
+        """
+        if self.model.seed_points is None:
+            return None
+        metadata = self.datamanager.train_dataparser_outputs.metadata
+        points, _ = self.model.seed_points
+        dataset = self.datamanager.eval_dataset
+        if split == "train":
+            dataset = self.datamanager.train_dataset
+        return PointObservations(points.float(), metadata.get(POINTS_FILE), dataset, self.device)
+
+    @cached_property
+    def _held_out_observations(self) -> PointObservations | None:
+        return self.point_observations("eval")
+
+    def _gain_of_held_out(self, data: Mapping[str, Any]) -> Tensor | None:
+        """Return the factors of sRGB's values of a held-out photo [3], 1 if it has too few points.
+
+        `data` is what the datamanager gives for it. The factors come from the colours that points have in the training
+        photos, or from EXIF if there are no points. None if the points are others than those of training.
+        """
+        table = self.model.exposure
+        if table is None:
+            return None
+        files = self.datamanager.eval_dataset.image_filenames
+        index = int(data["image_idx"])
+        if len(table.points) == 0:
+            return srgb_gains(self._stops_by_exif(files[index]))
+        observing = self._held_out_observations
+        if observing is None or len(observing.points) != len(table.points):
+            return None
+        observations = observing.of_one(index, data)
+        stops, _ = gains_of_others(observations, table.points.double().numpy(), 1)
+        return srgb_gains(torch.from_numpy(stops[0]))
+
+    def _stops_by_exif(self, file: Path) -> Tensor:
+        """Return log₂ of a held-out photo's gain, relative to the training photos' median, by EXIF; 0 without. [3]"""
+        training = exposures_of(self.datamanager.train_dataset.image_filenames)
+        own = exposure_stops(file)
+        if training is None or own is None:
+            return torch.zeros(3)
+        return torch.full((3,), own - statistics.median(training))
 
     def _view_cameras(self) -> list[Pinholes]:
         """Return the camera of each training view, with the pose that is learned so far."""

@@ -57,6 +57,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             max_off_axis=0.0,
             max_angular_scale=0.0,
             stereo_points=0,
+            exposure="off",
             clear_paths=False,
             strategy=StructureAwareStrategy(
                 eta_every=1,

@@ -305,23 +305,28 @@ class FlatModel:
         return image[..., :3]
 
 
-@pytest.mark.parametrize(("near_plane", "planes"), [(0.01, []), (0.3, [0.01])])
-def test_the_near_plane_of_other_viewers_is_measured_and_put_back(near_plane: float, planes: list[float]):
+@pytest.mark.parametrize(
+    ("near_plane", "max_off_axis", "drawn_as"),
+    [(0.01, 0.0, []), (0.3, 0.0, [(0.01, 0.0)]), (0.01, 4.0, [(0.01, 0.0)])],
+)
+def test_views_are_measured_as_other_viewers_draw_them_and_the_plan_is_put_back(
+    near_plane: float, max_off_axis: float, drawn_as: list[tuple[float, float]]
+):
     model: Any = FlatModel()
     model.config, model.device, drawn = SimpleNamespace(), "cpu", []
-    plan = model.plan = RenderOptions(near_plane=near_plane)  # of a run's plan only the near plane is read
+    plan = model.plan = RenderOptions(near_plane=near_plane, max_off_axis=max_off_axis)  # as much as is read of a plan
 
     def draw(camera: Any) -> dict[str, Tensor]:
-        drawn.append(model.plan.near_plane)
+        drawn.append((model.plan.near_plane, model.plan.max_off_axis))
         return {"rgb": torch.full((12, 12, 3), camera), "background": torch.zeros(3)}
 
     model.get_outputs_for_camera = draw
     view = (0.5, {"image": torch.zeros(12, 12, 3)})
-    assert evaluate.view_psnr_in_viewers(model, [view], [1.0]) == ([6.02] if planes else [1.0])
-    if planes:
+    assert evaluate.view_psnr_in_viewers(model, [view], [1.0]) == ([6.02] if drawn_as else [1.0])
+    if drawn_as:
         with pytest.raises(TypeError):  # of a camera that cannot be drawn
             evaluate.view_psnr_in_viewers(model, [(None, {})], [])
-    assert drawn == 2 * planes and model.plan is plan
+    assert drawn == 2 * drawn_as and model.plan is plan
 
 
 # Protocol and command

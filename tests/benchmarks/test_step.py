@@ -10,6 +10,7 @@ import torch
 from benchmarks import __main__ as bench
 from benchmarks import step as steps
 from benchmarks.step import REPEATS, Step, milliseconds
+from helpers import gsplat_stub
 from sadgs_ns.render.step_memory import StepSize, kept_bytes, step_bytes
 
 CPU = torch.device("cpu")
@@ -60,6 +61,18 @@ def test_the_parts_of_a_step_can_be_called_alone():
     for part in (step, step.render, step.compare, step.observe, step.optimize):
         part()
     assert step.params["means"].grad is not None and step.rendered.grad is not None
+
+
+def test_the_forward_projection_can_be_called_alone(monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("triton", reason="Triton is not installed")
+    monkeypatch.setattr(steps.gsplat_compat, "project", gsplat_stub.project)
+    drawn = []
+    for triton in (False, True):
+        step = Step(200, 40, 30, 1, CPU)
+        with steps.kernels.triton_switched(triton):
+            radii, means2d, _, _ = step.project()
+        drawn.append(steps.gsplat_compat.drawn(radii, means2d))
+    assert drawn[0].any() and (drawn[0] != drawn[1]).sum() <= 1
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="peaks are measured on CUDA")

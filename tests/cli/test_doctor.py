@@ -167,8 +167,8 @@ def test_a_gpu_its_driver_and_its_kernels_are_notes(
 ):
     monkeypatch.setattr(doctor, "_DRIVER_FILE", tmp_path / "version")
     assert about("A GPU") == ("note", f"GPU: A GPU, sm_89, 6.0 of 8.0 GB free, CUDA {torch.version.cuda}.")
-    assert about("Triton compiles its") == ("note", "Triton compiles its kernels here.")
-    assert about("gsplat has") == ("note", "gsplat has its CUDA kernels.")
+    told = "Triton compiles its kernels here, so gsplat's CUDA code and nvcc are not needed."
+    assert about("Triton compiles its") == ("note", told)
     assert about("driver") == ("note", "NVIDIA driver: unknown.")
     (tmp_path / "version").write_text(
         "NVRM version: NVIDIA UNIX Open Kernel Module for x86_64  580.95.05  Release Build\n"
@@ -230,8 +230,8 @@ def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, mon
 @pytest.mark.parametrize(
     ("program", "found", "severity", "need", "remedy"),
     [
-        ("nvcc", "nvcc", "note", "gsplat compiles with it", "the toolkit of torch's CUDA"),
-        ("C compiler", "clang", "warning", "Triton and gsplat", "the packages gcc, g++ and python3-dev"),
+        ("nvcc", "nvcc", "note", "only the backend gsplat needs it", "the toolkit of torch's CUDA"),
+        ("C compiler", "clang", "warning", "Triton compiles with it", "the packages gcc and python3-dev"),
         ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it for videos", "the package ffmpeg"),
         ("libusb-1.0", "usb-1.0", "warning", "`ns-export`, `ns-process-data` and meshes", "the package libusb-1.0-0"),
         ("Node.js", "npx", "warning", "pages (.html)", "version 22 or newer from nodejs.org"),
@@ -253,3 +253,13 @@ def test_programs_are_looked_for_and_their_use_is_told(
 def test_kernels_that_are_switched_off_are_told(cuda: SimpleNamespace):
     with kernels.triton_switched(False):
         assert about("SADGS_TRITON") == ("warning", "Training will take twice as long: SADGS_TRITON is 0, unset it.")
+        assert about("gsplat has") == ("note", "gsplat has its CUDA kernels.")
+
+
+@pytest.mark.hard_case("`sadgs-doctor` where gsplat's CUDA code was never compiled", "fine where Triton's kernels run")
+def test_gsplats_kernels_are_not_tried_where_tritons_run(cuda: SimpleNamespace):
+    """gsplat would compile them for minutes."""
+    cuda.has_gsplat = False
+    findings = machine()
+    assert "error" not in findings.values()
+    assert not any("gsplat has" in sentence for sentence in findings)

@@ -20,9 +20,9 @@ import sadgs_ns.kernels as package
 CONSTANTS = {
     "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 256, "RUN": 8, "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
     "VIEWS": 2, "BLOCK": 1024, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
-    "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "HIGHEST": 4.0,
+    "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "HIGHEST": 4.0, "FAR": 1e10,
     "OCTAVES": 12.0, "INVALID": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
-    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "CULL": True,
+    "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "LEARNED": True, "CULL": True,
     "DEPTHS": True, "PASSED": True, "FLAGS": 1, "FEW": 64,
     "PART": 256,
 }
@@ -30,7 +30,7 @@ INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_heig
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
 INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 eps l1_weight ssim_weight l2_weight".split()
-FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top".split()
+FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top near_plane".split()
 POINTERS = {
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
     "by_tile": "*i64", "ordered": "*i32", "parts": "*i64", "part_count": "*i64", "overflowed": "*i64",
@@ -86,6 +86,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
         "_activate",
         "_activate_backward",
         "_project_backward",
+        "_project_forward",
         "_correct",
         "_correct_backward",
     }

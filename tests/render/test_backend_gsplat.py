@@ -1,9 +1,11 @@
-"""The gsplat backend: with torch functions in the place of gsplat's on a CPU, and beside Triton's on a GPU."""
+"""The gsplat backend, with torch functions in gsplat's place on a CPU, and Triton's, which needs none of them."""
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
+import gsplat
 import pytest
 import torch
 from torch import Tensor
@@ -11,6 +13,7 @@ from torch import Tensor
 from helpers.gsplat_stub import stub_gsplat
 from helpers.rendered_scene import random_scene
 from sadgs_ns import kernels
+from sadgs_ns.errors import InputError
 from sadgs_ns.method.screen_gradients import keep_gradient
 from sadgs_ns.render import backend_gsplat, backend_torch, rasterization
 from sadgs_ns.render.rasterization import visible
@@ -92,3 +95,63 @@ def test_it_draws_what_the_triton_backend_draws(case: str, monkeypatch: pytest.M
     for name, expected in theirs.items():
         # Rounding moves a few pairs over a cut-off, so single values may differ by more than rounding: compare norms.
         assert (ours[name] - expected).norm() < 2e-3 * expected.norm(), name
+
+
+@pytest.fixture
+def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide gsplat's CUDA code, as where it was never compiled: calling it is an ImportError."""
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)
+    with pytest.raises(ImportError, match="_backend"):
+        gsplat.spherical_harmonics(0, torch.ones(1, 3), torch.ones(1, 1, 3))
+
+
+@pytest.mark.hard_case("gsplat's CUDA code was never compiled", "the Triton backend draws")
+@pytest.mark.parametrize("case", ["depth", "near plane", "features"])
+def test_the_triton_backend_draws_without_gsplats_kernels(
+    case: str, hidden: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
+    options, views = CASES[case]
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    with kernels.triton_switched(True):
+        ours = drawn_by(backend_triton, options, views, 24, device, torch.float32)
+    expected = drawn_by(backend_torch, options, views, 24, "cpu", torch.float64)
+    assert (ours.pop("visible") != expected.pop("visible")).sum() <= 1
+    assert ours.keys() == expected.keys()
+    for name, value in expected.items():
+        # Rounding moves a few pairs over a cut-off.
+        assert (ours[name] - value).norm() < 2e-3 * value.norm(), name
+
+
+@pytest.mark.parametrize("of_each_view", [False, True])
+def test_the_triton_backend_takes_coefficients_in_one_tensor(of_each_view: bool, hidden: None) -> None:
+    scene = {name: value.float() for name, value in random_scene(40, 16, seed=0).items()}
+    pytest.importorskip("triton", reason="Triton is not installed")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    means, quats, scales, opacities, colors = (
+        scene[name].to(device) for name in ("means", "quats", "scales", "opacities", "colors")
+    )
+    cameras = Cameras(scene["viewmats"].to(device), scene["Ks"].to(device), 16, 16)
+    one_tensor = colors[None] if of_each_view else colors
+    images = []
+    with kernels.triton_switched(True):
+        for coefficients in (one_tensor, (colors[:, 0], colors[:, 1:])):
+            gaussians = Gaussians(means, quats, scales, opacities, coefficients)
+            options = RenderOptions(sh_degree=3, backend="triton")
+            images.append(rasterization.rasterize(gaussians, cameras, options)[0])
+    torch.testing.assert_close(images[0], images[1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (RenderOptions(expected_depth=True, absgrad=True), "sums absolute gradients of 3 channels, and these are 4: "),
+        (RenderOptions(sh_degree=4), "draws spherical harmonics up to degree 3, and these have 4"),
+    ],
+    ids=["absolute gradients of depth", "degree 4"],
+)
+def test_what_the_triton_backend_cannot_draw_is_refused(options: RenderOptions, problem: str) -> None:
+    backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    with pytest.raises(InputError, match=f"^The backend triton {problem}"), kernels.triton_switched(True):
+        drawn_by(backend_triton, options, 1, 16, device, torch.float32)

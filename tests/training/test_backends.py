@@ -1,7 +1,8 @@
-"""Runs with the gsplat backend; where there is no GPU, torch functions stand in for gsplat's kernels."""
+"""Runs with the gsplat backend, and without gsplat's CUDA code; without a GPU, torch functions stand in for kernels."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -126,3 +127,29 @@ def test_where_it_cannot_draw_it_is_refused(config: SadgsTrainerConfig, monkeypa
     monkeypatch.setattr(model_module, "choose_backend", lambda *args: asked.append(args))
     model.shard(world)
     assert asked == [("auto", world.device, True)]
+
+
+@pytest.mark.hard_case("gsplat's CUDA code was never compiled", "Triton trains, renders and exports")
+def test_with_triton_nothing_calls_gsplats_cuda_code(
+    scene: Path, colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", None)  # Importing it is an error.
+    with pytest.raises(ImportError, match="_backend"):
+        gsplat.spherical_harmonics(0, torch.ones(1, 3), torch.ones(1, 1, 3))
+    if not ON_GPU:
+        interpreted = pytest.importorskip("helpers.interpreted_rasterizer", exc_type=ImportError)
+        interpreted.use_our_rasterizer(monkeypatch)
+    config = configure(tmp_path, colmap, ITERATIONS)
+    trainer = train(config)
+    model = trainer.pipeline.model
+    assert model.backend == "triton" and is_finite(model)
+    steps: Any = model.strategy_state["structure_steps"]
+    assert sum(step["split"] for step in steps) > 0
+    cameras = trainer.pipeline.datamanager.eval_dataset.cameras
+    with torch.no_grad():
+        outputs = model.get_outputs(cameras[0:1].to(model.device))
+        normals = model.get_normals(cameras[0:1].to(model.device))
+    assert outputs["rgb"].isfinite().all() and (outputs["depth"] > 0).any()
+    assert normals.shape == outputs["rgb"].shape
+    run = [str(trainer.base_dir), "--data", str(scene)]
+    assert export.main([*run, "--output", str(tmp_path / "splat.ply"), "--min-views", "1"]) == 0

@@ -35,7 +35,8 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
         views=model.plan.views_per_iteration,
         sh_degree=model.config.sh_degree,
         is_black=model.config.background_color == "black",
-        has_color_matrices=model.color_matrices is not None,
+        has_color_matrices=model.has_view_colors,
+        learns_color_matrices=model.color_matrices is not None,
         single_process=model.world.is_single,
         size=(int(sizes.width.max()), int(sizes.height.max())),
         # The run's own near plane may lie behind these Gaussians, which would launch no compositing.

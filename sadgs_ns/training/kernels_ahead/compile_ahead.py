@@ -96,7 +96,6 @@ def find_kernels() -> None:
     from triton.compiler import ASTSource
     from triton.runtime import driver
 
-    from sadgs_ns import gsplat_compat
     from sadgs_ns.kernels import tiles, trial, triton_switched
     from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 
@@ -114,18 +113,7 @@ def find_kernels() -> None:
             _found.append((source, target, options))
         return True  # Triton neither compiles nor launches it.
 
-    def project(means: Any, quats: Any, scales: Any, opacities: Any, viewmats: Any, *_: Any) -> Any:
-        shape = (len(viewmats), len(means))
-        radii = torch.ones(shape, dtype=torch.int32)
-        if gsplat_compat.RADII_PER_AXIS:
-            radii = torch.ones((*shape, 2), dtype=torch.int32)
-        means2d = means.new_ones((*shape, 2))
-        depths = means.new_ones(shape)
-        conics = means.new_ones((*shape, 3))
-        return radii, means2d, depths, conics
-
-    # gsplat would project on the GPU, and nothing counts pairs.
-    gsplat_compat.project = project
+    # Nothing counts pairs.
     tiles.PairCounts.wait = lambda self: [1]
     knobs.runtime.jit_cache_hook = note
     trial.hash_kernels()

@@ -36,6 +36,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
+    learns_color_matrices: bool = False
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
@@ -116,7 +117,8 @@ class Stages:
         shape = self.views, _SIZE, _SIZE
         renders = torch.zeros((*shape, 3), device=self.device, requires_grad=True)
         alphas = torch.zeros((*shape, 1), device=self.device, requires_grad=True)
-        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1).requires_grad_()
+        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1)
+        matrices.requires_grad_(self.choice.learns_color_matrices)
         correct_colors(renders, alphas, matrices).sum().backward()
 
     def update(self) -> None:

@@ -9,6 +9,7 @@ from sadgs_ns.method.schedule import Schedule
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import processes
+from sadgs_ns.training.run.exposure_start import resume_with_gains, start_with_gains
 from sadgs_ns.training.run.planning import decide_near_plane, one_device_is_quicker, plan_length, plan_run
 from sadgs_ns.training.run.processes import Peers
 from sadgs_ns.training.run.progress import note
@@ -41,6 +42,8 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     if resumed is not None:
         before = resumed.plan
     near_plane = decide_near_plane(pipeline, before)
+    if resumed is None:
+        start_with_gains(pipeline, world)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
     if resumed is None:
         pipeline.clear_paths(near_plane)
@@ -53,6 +56,7 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     if resumed is not None:
         resumed.load_gaussians(pipeline, world)
         start_step = resumed.state["step"] + 1
+        resume_with_gains(pipeline, world)
     pipeline.check_visibility(near_plane)
     plan = plan_run(config, pipeline, length, near_plane=near_plane, dense=is_dense, before=before, done=start_step)
     pipeline.follow(plan)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sadgs_ns.geometry.dense_start import NUMBER, dense_points
 from sadgs_ns.geometry.extents import plausible_points
+from sadgs_ns.geometry.point_colors import apply_gains
 from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.quantization import dequantize
@@ -72,7 +73,11 @@ def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
         return images[views[place]]["image"]
 
     def photo_of(place: int) -> Tensor:
-        return cache.photo(images[views[place]])[..., :3]
+        photo = cache.photo(images[views[place]])[..., :3]
+        if model.exposure is None:
+            return photo
+        to_median = 1 / model.exposure.gains()[views[place]]
+        return apply_gains(photo, to_median.to(photo)).clamp(0, 1)
 
     def wavelength_of(place: int) -> Tensor:
         return wavelength(dequantize(cache[views[place]]))

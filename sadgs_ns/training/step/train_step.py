@@ -19,7 +19,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.step.color_matrices import anchored, correct_colors
+from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import stack, stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
 
@@ -138,7 +138,10 @@ def _render_and_compare(
         infos.append(info)
         for band, colors, alphas in pictures:
             if group.view_ids is not None:
-                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], group.view_ids))
+                view_ids = group.view_ids
+                if band is not None:
+                    view_ids = view_ids[band.view : band.view + 1]
+                colors = correct_colors(colors, alphas, model.view_matrices(leaves, view_ids))
             rgb = model.before_background(colors, alphas, model.background)
             pair = model.masked_pair(rgb, group.batch(band), model.background)
             loss, quality, views = _compare(pair, group, band, model.config.ssim_lambda, penalty)

@@ -47,6 +47,25 @@ def test_colours_and_all_gradients_equal_the_float64_reference(
     torch.testing.assert_close(*results, atol=2e-5, rtol=2e-5)
 
 
+@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
+def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
+    monkeypatch: pytest.MonkeyPatch, kernels: bool
+):
+    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
+    render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 33, 47))
+    results = []
+    for learned in (True, False):
+        colors = render.clone().requires_grad_()
+        opacity = alpha.clone().requires_grad_()
+        of_views = matrices.clone().requires_grad_(learned)
+        corrected = correct_colors(colors, opacity, of_views)
+        corrected.backward(upstream)
+        assert (of_views.grad is not None) == learned
+        results.append([corrected.detach(), colors.grad, opacity.grad])
+    for expected, found in zip(*results, strict=True):
+        assert torch.equal(expected, found)
+
+
 def test_the_kernel_is_what_is_compared(monkeypatch: pytest.MonkeyPatch):
     called: list[Any] = []
     monkeypatch.setattr(fused, "correct_colors", lambda *values: called.append(values))

@@ -19,6 +19,7 @@ from helpers.kill_and_resume import set_up
 from helpers.short_runs import configure
 from sadgs_ns import kernels
 from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.run import exposure_start
 from sadgs_ns.training.run.trainer import SadgsTrainer
 from sadgs_ns.training.step import cuda_graphs, optimizers
 from sadgs_ns.training.step.cuda_graphs import Results
@@ -124,18 +125,29 @@ def assert_equal(one: dict[str, Tensor], other: dict[str, Tensor], what: str = "
     assert not wrong, f"{what}: {wrong}"
 
 
+def choose_colors(config: SadgsTrainerConfig, colors: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a run train with learned colour matrices, with gains however small they are, or with none of them."""
+    config.pipeline.model.color_model = "none"
+    if colors == "affine":
+        config.pipeline.model.color_model = "affine"
+    if colors == "gains":
+        monkeypatch.setattr(exposure_start, "LEAST_DEVIATION", 0.0)
+        monkeypatch.setattr(exposure_start, "LEAST_REDUCTION", -1.0)
+
+
 @on_cpu
-@pytest.mark.parametrize("color_model", ["none", "affine"])
+@pytest.mark.parametrize("color_model", ["none", "affine", "gains"])
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     color_model: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
-    short.pipeline.model.color_model = color_model
+    choose_colors(short, color_model, monkeypatch)
     short.pipeline.views_per_iteration = 2
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
     assert replayed.graphed.replayed > ITERATIONS / 3
     assert expected == found
     assert_equal(tensors(launched), tensors(replayed))
+    assert (replayed.pipeline.model.exposure is not None) == (color_model == "gains")
     assert len({count for *_, count, _ in expected[1::2]}) > 2
 
 
@@ -334,13 +346,15 @@ def test_there_are_no_graphs_on_a_cpu(short: SadgsTrainerConfig):
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="graphs are CUDA's")
-@pytest.mark.parametrize(("views", "color_model"), [(1, "none"), (2, "none"), (2, "affine")])
-def test_a_gpu_trains_alike_with_graphs(colmap: ColmapDataParserConfig, tmp_path: Path, views: int, color_model: Any):
+@pytest.mark.parametrize(("views", "color_model"), [(1, "none"), (2, "none"), (2, "affine"), (2, "gains")])
+def test_a_gpu_trains_alike_with_graphs(
+    colmap: ColmapDataParserConfig, tmp_path: Path, views: int, color_model: Any, monkeypatch: pytest.MonkeyPatch
+):
     """Atomic additions come in any order, so that two runs differ by rounding, and grow apart once they densify."""
     schedule = {"absgs_every": 60, "structure_every": 120, "reset_every": 0, "refine_stop_iter": 180, "eta_every": 10}
     config = configure(tmp_path, colmap, 300, **schedule, refine_start_iter=60)
     config.pipeline.views_per_iteration = views
-    config.pipeline.model.color_model = color_model
+    choose_colors(config, color_model, monkeypatch)
     (_, expected), (replayed, found) = run(config, False), run(config, True)
     if not kernels.use_triton(replayed.pipeline.model.device):
         pytest.skip("Triton does not run here")

@@ -1,7 +1,7 @@
 """Whole runs with tile lists of a length that is foreseen: as with exact lists, and repeated where they are too short.
 
-Triton's interpreter runs the kernels that make the lists. Torch code stands in for gsplat's projection, and the
-splatter's compositing, which reads the lists as gsplat's kernel does, for the compositing.
+Triton's interpreter runs the kernels that project and make the lists. The splatter's compositing, which reads the lists
+as gsplat's kernel does, stands in for the compositing.
 """
 
 from __future__ import annotations

@@ -1,0 +1,42 @@
+"""Which of a capture's images see which of its points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sadgs_ns.data import colmap
+
+
+def points_seen(source: Path, files: Sequence[Path]) -> list[NDArray[np.int64]] | None:
+    """Return which points each image file sees, by the tracks of a COLMAP reconstruction; None if it has no tracks.
+
+    `source` is the reconstruction's file of points. A file belongs to the image whose name its path ends with. Raises
+    InputError if the reconstruction is damaged.
+    """
+    image_ids, points = colmap.read_tracks(source)
+    kind = colmap.model_kind(source.parent)
+    if len(points) == 0 or kind is None:
+        return None
+    names = colmap.read_image_ids(source.parent / f"images.{kind}")
+    ids = {name: image_id for image_id, name in names.items()}
+    order = np.argsort(image_ids, kind="stable")
+    sorted_ids = image_ids[order]
+    seen = []
+    for file in files:
+        image_id = _id_of(file, ids)
+        start, end = np.searchsorted(sorted_ids, [image_id, image_id + 1])
+        seen.append(np.unique(points[order[start:end]]))
+    return seen
+
+
+def _id_of(file: Path, ids: dict[str, int]) -> int:
+    """Return the id of the image with the longest name that the file's path ends with, or −1."""
+    for start in range(len(file.parts)):
+        name = "/".join(file.parts[start:])
+        if name in ids:
+            return ids[name]
+    return -1

@@ -1,0 +1,165 @@
+"""Gains of the training photos, if their exposures differ: found before a run begins, and kept when it is resumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sadgs_ns.data.exif_exposure import exposures_of
+from sadgs_ns.distributed.world import World
+from sadgs_ns.geometry.exposure import (
+    FEWEST_POINTS,
+    Exposures,
+    Observations,
+    fit_exposures,
+    gains_of_others,
+    mean_gains,
+    points_at_median,
+)
+from sadgs_ns.training.exposure_table import ExposureTable, photo_names
+from sadgs_ns.training.pipeline import SadgsPipeline
+from sadgs_ns.training.run.progress import note, warn
+
+LEAST_DEVIATION = 0.1
+"""Standard deviation of the gains, in stops of linear light, from which they are used."""
+LEAST_REDUCTION = 0.1
+LEAST_PROJECTED_REDUCTION = 0.2
+"""Shares by which gains must reduce the median residual of points' colours to be used, with tracks and without.
+Where exposure is fixed, what looks like gains reduces it less."""
+_DISAGREEMENT = 0.5  # Stops by which the ranges of EXIF's exposures and of the gains may differ without a line
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Gains that were found, and whether to use them."""
+
+    stops: Tensor  # float64 [V, 3]
+    points: Tensor  # float32 [P, 3]
+    observations: Observations | None  # Of the points, if these told the gains
+    used: bool
+    sentence: str  # For the user
+
+
+def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
+    """Find the gains of the training photos, let the model use them if exposure varies, and print a line about it.
+
+    All processes have the gains of the first. It loads the images. Call it before points of stereo depth are added.
+    """
+    model = pipeline.model
+    if not model.may_use_gains:
+        return
+    found = _find(pipeline)
+    if found is None:
+        return
+    used = torch.tensor([float(found.used)], device=world.device)
+    world.broadcast(used, 0)
+    note(found.sentence)
+    if not used.item():
+        return
+    stops = found.stops.to(world.device)
+    points = found.points.to(world.device)
+    world.broadcast(stops, 0)
+    world.broadcast(points, 0)
+    names = photo_names(pipeline.datamanager.train_dataset.image_filenames)
+    model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
+    if found.observations is not None:
+        means = mean_gains(found.observations, stops.cpu().numpy(), len(points))
+        model.color_points(torch.from_numpy(means).float())
+
+
+def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
+    """Keep the gains of a checkpoint that was loaded, and find those of photos that were added since.
+
+    The gains of the others do not change, and so neither does the median. Without gains in the checkpoint, or if the
+    options ask for none, the run goes on without.
+    """
+    model = pipeline.model
+    before = model.exposure
+    if before is None:
+        return
+    if not model.may_use_gains:
+        model.set_exposure(None)
+        return
+    dataset = pipeline.datamanager.train_dataset
+    names = photo_names(dataset.image_filenames)
+    if names == before.names:
+        return
+    rows = {name: row for row, name in enumerate(before.names)}
+    stops = torch.zeros((len(names), 3), dtype=torch.float64)
+    kept = np.zeros(len(names), bool)
+    for view, name in enumerate(names):
+        if name in rows:
+            stops[view] = before.stops[rows[name]]
+            kept[view] = True
+    points = before.points
+    observing = pipeline.point_observations("train")
+    if observing is not None:
+        observations = observing.of_all(pipeline.datamanager.cached_train)
+        num_points = len(observing.points)
+        light = points_at_median(observations.of_views(kept), stops.numpy(), num_points)
+        others, _ = gains_of_others(observations, light, len(names))
+        stops = torch.where(torch.from_numpy(kept)[:, None], stops, torch.from_numpy(others))
+        points = torch.from_numpy(light).float()
+    stops = stops.to(world.device)
+    points = points.to(world.device)
+    world.broadcast(stops, 0)
+    world.broadcast(points, 0)
+    model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
+    note(f"Gains of exposure: {int(kept.sum())} photos keep theirs, {int((~kept).sum())} were added.")
+
+
+def _find(pipeline: SadgsPipeline) -> _Found | None:
+    """Find gains by the points, or by EXIF if there are no points; None if there is neither."""
+    files = pipeline.datamanager.train_dataset.image_filenames
+    tags = exposures_of(files)
+    observing = pipeline.point_observations("train")
+    if observing is not None:
+        observations = observing.of_all(pipeline.datamanager.cached_train)
+        fitted = fit_exposures(observations, len(files), len(observing.points))
+        if fitted.known.any():
+            if tags is not None:
+                _warn_of_disagreement(fitted, tags)
+            return _by_points(fitted, observations, observing.has_tracks)
+    if tags is None:
+        return None
+    stops = np.array(tags) - np.median(tags)
+    used = bool(stops.std() >= LEAST_DEVIATION)
+    sentence = _sentence(float(stops.std()), float(np.ptp(stops)), "by EXIF", used)
+    return _Found(torch.from_numpy(stops)[:, None].repeat(1, 3), torch.zeros((0, 3)), None, used, sentence)
+
+
+def _by_points(fitted: Exposures, observations: Observations, has_tracks: bool) -> _Found:
+    """Decide whether gains that were fitted to points are used."""
+    needed = LEAST_PROJECTED_REDUCTION
+    if has_tracks:
+        needed = LEAST_REDUCTION
+    reduced = fitted.residual_after <= (1 - needed) * fitted.residual_before
+    used = fitted.deviation >= LEAST_DEVIATION and reduced
+    sentence = _sentence(fitted.deviation, fitted.spread, "by the points' colours", used)
+    without = int((~fitted.known).sum())
+    if used and without:
+        sentence += f" {without} of them share fewer than {FEWEST_POINTS} points with others, and have a gain of 1."
+    points = torch.from_numpy(fitted.points).float()
+    return _Found(torch.from_numpy(fitted.stops), points, observations, used, sentence)
+
+
+def _sentence(deviation: float, spread: float, source: str, used: bool) -> str:
+    """Say how much exposure varies, in stops, and what follows."""
+    varies = f"Exposure, {source}, varies by {deviation:.2f} stops (range {spread:.2f}) between the training photos"
+    if used:
+        return f"{varies}: each is compared with a rendering at its own exposure, and the splat has the median."
+    return f"{varies}, which is too little, or too unsure, for gains of their own."
+
+
+def _warn_of_disagreement(fitted: Exposures, tags: list[float]) -> None:
+    """Print a line if EXIF's exposures have another range than the gains."""
+    known = np.array(tags)[fitted.known]
+    by_tags = float(np.ptp(known))
+    if abs(by_tags - fitted.spread) > _DISAGREEMENT:
+        warn(
+            f"By EXIF, exposure varies in a range of {by_tags:.1f} stops, but by the points' colours of "
+            f"{fitted.spread:.1f}: the points decide."
+        )

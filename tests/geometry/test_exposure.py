@@ -1,0 +1,98 @@
+"""Gains of photos are found from drawn colours of points, whose gains are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sadgs_ns.geometry import exposure
+from sadgs_ns.geometry.exposure import FEWEST_POINTS, Observations, fit_exposures, gains_of_others, points_at_median
+
+VIEWS, POINTS, TRACK = 12, 800, 5
+
+
+def drawn(
+    spread: float = 0.3, noise: float = 0.05, views: int = VIEWS, seed: int = 0
+) -> tuple[Observations, np.ndarray, np.ndarray]:
+    """Observations of points by five photos each, the gains [V, 3], whose median is 0, and the colours [P, 3]."""
+    generator = np.random.default_rng(seed)
+    gains = spread * generator.normal(size=(views, 1)) + 0.2 * spread * generator.normal(size=(views, 3))
+    gains -= np.median(gains, axis=0)
+    colors = generator.uniform(-5, -1, (POINTS, 3))
+    seen = np.stack([generator.permutation(views)[:TRACK] for _ in range(POINTS)])
+    points = np.repeat(np.arange(POINTS), TRACK)
+    stops = gains[seen.ravel()] + colors[points] + noise * generator.normal(size=(POINTS * TRACK, 3))
+    return Observations(seen.ravel(), points, stops), gains, colors
+
+
+def test_known_gains_and_colours_are_found_and_the_median_gain_is_1():
+    observations, gains, colors = drawn()
+    found = fit_exposures(observations, VIEWS, POINTS)
+    assert found.known.all()
+    np.testing.assert_allclose(found.stops, gains, atol=0.03)
+    np.testing.assert_allclose(np.median(found.stops, axis=0), 0, atol=1e-12)
+    assert np.abs(found.points - colors).mean() < 0.05
+    means = gains.mean(axis=1)
+    assert found.deviation == pytest.approx(means.std(), abs=0.02)
+    assert found.spread == pytest.approx(np.ptp(means), abs=0.04)
+    assert found.residual_after < 0.4 * found.residual_before
+
+
+@pytest.mark.hard_case("a fifth of all observations of exposure is wrong", "the gains stay within .05 stops")
+def test_gains_withstand_a_fifth_of_wrong_observations():
+    observations, gains, _ = drawn()
+    generator = np.random.default_rng(1)
+    wrong = generator.random(len(observations.views)) < 0.2
+    observations.stops[wrong] += generator.uniform(-3, 3, (int(wrong.sum()), 3))
+    np.testing.assert_allclose(fit_exposures(observations, VIEWS, POINTS).stops, gains, atol=0.05)
+
+
+@pytest.mark.hard_case("a photo that shares few points with others", "has a gain of 1, and moves no other gain")
+def test_a_photo_with_few_points_has_a_gain_of_1_and_does_not_move_the_others():
+    observations, gains, _ = drawn()
+    fewest = FEWEST_POINTS - 1
+    few = np.flatnonzero(observations.views == 3)[:fewest]
+    kept = observations.views != 3
+    kept[few] = True
+    observations.stops[few] += 5
+    found = fit_exposures(
+        Observations(observations.views[kept], observations.points[kept], observations.stops[kept]), VIEWS, POINTS
+    )
+    others = np.arange(VIEWS) != 3
+    assert found.known.tolist() == others.tolist() and not found.stops[3].any()
+    expected = gains[others] - np.median(gains[others], axis=0)
+    np.testing.assert_allclose(found.stops[others], expected, atol=0.05)
+
+
+def test_photos_with_one_exposure_have_no_spread_beyond_noise():
+    observations, _, _ = drawn(spread=0.0)
+    found = fit_exposures(observations, VIEWS, POINTS)
+    assert found.deviation < 0.01 and found.spread < 0.03
+    assert found.residual_after > 0.97 * found.residual_before
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_without_common_points_all_gains_are_1(count: int):
+    views = np.arange(3 * count)
+    found = fit_exposures(Observations(views, np.zeros_like(views), np.zeros((len(views), 3))), 3, 1)
+    assert not found.known.any() and not found.stops.any() and found.deviation == found.spread == 0
+    assert np.isnan(found.points).all()
+
+
+def test_photos_that_were_not_fitted_get_gains_by_the_points_colours():
+    observations, gains, _ = drawn()
+    fitted = np.arange(VIEWS) < 9
+    stops = np.where(fitted[:, None], gains, 0.0)
+    light = points_at_median(observations.of_views(fitted), stops, POINTS)
+    found, known = gains_of_others(observations.of_views(~fitted), light, VIEWS)
+    assert known.tolist() == (~fitted).tolist()
+    np.testing.assert_allclose(found, np.where(fitted[:, None], 0.0, gains), atol=0.03)
+
+
+def test_many_observations_are_thinned_out_by_points(monkeypatch: pytest.MonkeyPatch):
+    observations, gains, _ = drawn()
+    monkeypatch.setattr(exposure, "MOST_OBSERVATIONS", len(observations.views) / 3)
+    found = fit_exposures(observations, VIEWS, POINTS)
+    known = np.isfinite(found.points).all(axis=1)
+    assert known.sum() == pytest.approx(POINTS / 3, abs=1)
+    np.testing.assert_allclose(found.stops, gains, atol=0.05)

@@ -1,0 +1,233 @@
+"""Whole runs on photos whose exposures are known: gains come from points' colours and stay as they were found."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.models.splatfacto import SH2RGB
+from PIL import ExifTags, Image
+
+from benchmarks.evaluate import quality
+from benchmarks.exposures import with_gains
+from examples.drawn_scene.scene import describe_scene, write_scene
+from helpers.gloo_ranks import run_ranks
+from helpers.kill_and_resume import parser_of, set_up
+from helpers.sharded_training import few_steps, set_up_together
+from helpers.short_runs import configure, nerfstudio_data, train
+from sadgs_ns.distributed.world import World
+from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.model import SadgsModel
+from sadgs_ns.training.run import exposure_start
+from sadgs_ns.training.run.trainer import SadgsTrainer
+
+WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 14, 1500
+APART = 1.5
+"""Stops between the two exposures of the training photos."""
+INTERVAL = 8
+"""Every 8th photo from the first is held out."""
+
+
+def stops_of(index: int) -> float:
+    """log₂ of a photo's gain: every other training photo is darker, and held-out ones lie between."""
+    if index % INTERVAL == 0:
+        return -0.5 * APART
+    place = index - index // INTERVAL  # Among the training photos, which are as many of either exposure
+    return -APART * (place % 2)
+
+
+@pytest.fixture(scope="module")
+def exposed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drawn room with photos of two exposures, and held-out photos with their median; to be read only."""
+    folder = tmp_path_factory.mktemp("exposed") / "room"
+    write_scene(folder, WIDTH, HEIGHT, VIEWS, POINTS)
+    for index, path in enumerate(sorted((folder / "images").iterdir())):
+        gains = np.full(3, 2.0 ** stops_of(index))
+        Image.fromarray(with_gains(np.asarray(Image.open(path)), gains)).save(path)
+    return folder
+
+
+def run_of(scene: Path, output: Path, exposure: Any = "auto", iterations: int = 2) -> SadgsTrainerConfig:
+    config = configure(output, parser_of(scene), iterations)
+    config.machine.device_type = "cpu"
+    config.pipeline.views_per_iteration = 1
+    config.pipeline.model.exposure = exposure
+    config.pipeline.model.strategy.refine_stop_iter = 0
+    return config
+
+
+def training_stops() -> np.ndarray:
+    stops = np.array([stops_of(index) for index in range(VIEWS) if index % INTERVAL])
+    return stops - np.median(stops)
+
+
+def test_photos_of_two_exposures_train_to_the_median_exposure(exposed: Path, tmp_path: Path, monkeypatch: Any):
+    monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))  # Its weights would be downloaded.
+    measured = {}
+    for exposure in ("auto", "off"):
+        trainer = train(run_of(exposed, tmp_path / exposure, exposure, 150))
+        trainer.pipeline.eval()
+        model = trainer.pipeline.model
+        measured[exposure] = quality(model, trainer.pipeline.datamanager.fixed_indices_eval_dataloader)
+        means = trainer.pipeline.get_average_eval_image_metrics()
+        assert ("gain_psnr" in means) == (exposure == "auto")
+    assert measured["auto"]["psnr"] > measured["off"]["psnr"] + 0.4
+    assert measured["auto"]["ssim"] > measured["off"]["ssim"] + 0.02
+    assert measured["auto"]["gain_psnr"] == pytest.approx(measured["auto"]["psnr"], abs=0.3), "they have the median"
+    assert "gain_psnr" not in measured["off"]
+
+
+def test_gains_and_colours_of_points_are_those_that_were_drawn(exposed: Path, tmp_path: Path, capsys: Any):
+    model = set_up(run_of(exposed, tmp_path)).pipeline.model
+    assert "Exposure, by the points' colours, varies by 0.7" in " ".join(capsys.readouterr().out.split())
+    table = model.exposure
+    assert table is not None and model.gain_matrices is not None
+    np.testing.assert_allclose(table.stops, np.repeat(training_stops()[:, None], 3, axis=1), atol=0.1)
+    expected = torch.exp2(table.stops / 2.4).float()
+    torch.testing.assert_close(model.gain_matrices.diagonal(dim1=1, dim2=2), expected)
+    torch.testing.assert_close(model.gain_matrices[:, :, 3], 0.055 * (expected - 1))
+
+
+def test_colours_of_points_are_brought_from_their_photos_mean_to_the_median_exposure(exposed: Path, tmp_path: Path):
+    model = set_up(run_of(exposed, tmp_path / "auto")).pipeline.model
+    plain = set_up(run_of(exposed, tmp_path / "off", "off")).pipeline.model
+    described = describe_scene(WIDTH, HEIGHT, VIEWS, POINTS, 0)
+    of_training = [index for index in range(VIEWS) if index % INTERVAL]
+    sees = described.tracks[:, of_training]
+    means = (sees * training_stops()).sum(1) / sees.sum(1)
+    before = SH2RGB(plain.gauss_params["features_dc"].detach()).double().numpy()
+    after = SH2RGB(model.gauss_params["features_dc"].detach()).double().numpy()
+    assert len(before) == POINTS
+    expected = (before + 0.055) * 2.0 ** (-means[:, None] / 2.4) - 0.055
+    close = np.abs(after - expected.clip(0, 1)) < 0.02
+    moved = np.abs(means) > 0.05
+    assert moved.mean() > 0.3 and close[moved].mean() > 0.8, "but where photos are too dark or clipped"
+
+
+def test_even_exposure_trains_without_gains_and_a_line_says_so(tmp_path: Path, capsys: Any):
+    write_scene(tmp_path / "room", WIDTH, HEIGHT, VIEWS, POINTS)
+    model = set_up(run_of(tmp_path / "room", tmp_path / "out")).pipeline.model
+    assert model.exposure is None and model.view_ids([0]) is None
+    assert "which is too little" in " ".join(capsys.readouterr().out.split())
+
+
+def test_other_options_train_without_gains(exposed: Path, tmp_path: Path):
+    for name, change in (("exposure", "off"), ("color_model", "affine")):
+        config = run_of(exposed, tmp_path / name)
+        setattr(config.pipeline.model, name, change)
+        assert set_up(config).pipeline.model.exposure is None
+
+
+def test_a_resumed_run_has_the_same_gains_bit_for_bit(exposed: Path, tmp_path: Path, monkeypatch: Any):
+    first = train(run_of(exposed, tmp_path / "first")).pipeline.model.exposure
+    config = run_of(exposed, tmp_path / "again", iterations=4)
+    config.load_dir = tmp_path / "first/test/sadgs/run/nerfstudio_models"
+    monkeypatch.setattr("sadgs_ns.training.run.exposure_start.fit_exposures", None)  # It is not computed anew.
+    model = set_up(config).pipeline.model
+    assert first is not None and model.exposure is not None
+    assert model.exposure.names == first.names and torch.equal(model.exposure.stops, first.stops)
+    assert torch.equal(model.gain_matrices, first.matrices())  # type: ignore[arg-type]
+    config.pipeline.model.exposure = "off"
+    assert set_up(config).pipeline.model.exposure is None
+
+
+@pytest.mark.hard_case("photos are added to a run with gains", "the earlier ones keep their gains, and so the median")
+def test_added_photos_do_not_move_the_gains_of_earlier_ones(exposed: Path, tmp_path: Path, monkeypatch: Any):
+    config = run_of(exposed, tmp_path / "first")
+    parser: Any = config.pipeline.datamanager.dataparser
+    parser.eval_mode, parser.eval_interval = "interval", 4
+    before = train(config).pipeline.model.exposure
+    config = run_of(exposed, tmp_path / "again", iterations=4)
+    config.load_dir = tmp_path / "first/test/sadgs/run/nerfstudio_models"
+    after = set_up(config).pipeline.model.exposure
+    assert before is not None and after is not None
+    rows = {name: row for row, name in enumerate(after.names)}
+    kept = [rows[name] for name in before.names]
+    assert len(before.names) < len(after.names) and torch.equal(after.stops[kept], before.stops)
+    shift = (after.stops[kept].mean(dim=1).numpy() - training_stops()[kept]).mean()
+    np.testing.assert_allclose(after.stops.mean(dim=1).numpy(), training_stops() + shift, atol=0.06)
+
+
+def exposures_together(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
+    """Train in several processes, as `exposures_of` in one."""
+    return exposures_of(set_up_together(world, config))
+
+
+def exposures_of(trainer: SadgsTrainer) -> dict[str, Any]:
+    """Train, and return this process's gains and losses."""
+    losses = []
+    iterate = trainer.train_iteration
+
+    def noted(step: int) -> Any:
+        result = iterate(step)
+        losses.append(float(result[0]))
+        return result
+
+    trainer.train_iteration = noted  # type: ignore[method-assign]
+    trainer.train()
+    model = trainer.pipeline.model
+    assert model.exposure is not None and model.gain_matrices is not None
+    return {"stops": model.exposure.stops, "matrices": model.gain_matrices, "losses": losses}
+
+
+def test_two_processes_train_with_the_same_gains_as_one(exposed: Path, tmp_path: Path):
+    def configured(name: str) -> SadgsTrainerConfig:
+        config = few_steps(exposed, tmp_path / name, views=2)
+        config.pipeline.model.bounding_box_points = False
+        return config
+
+    torch.manual_seed(0)
+    alone = exposures_of(set_up(configured("alone")))
+    results = run_ranks(exposures_together, 2, tmp_path / "meet", configured("together"))
+    for result in results:
+        assert torch.equal(result["stops"], alone["stops"]) and torch.equal(result["matrices"], alone["matrices"])
+        torch.testing.assert_close(
+            torch.tensor(result["losses"][:4]), torch.tensor(alone["losses"][:4]), rtol=1e-5, atol=0
+        )
+
+
+def with_exif(folder: Path, name: str) -> NerfstudioDataParserConfig:
+    """Data without points, whose photos' EXIF says that every other one was exposed half as long."""
+    parser = nerfstudio_data(folder)
+    path = parser.data / "transforms.json"
+    meta = json.loads(path.read_text())
+    for index, frame in enumerate(meta["frames"]):
+        drawn = parser.data / frame["file_path"]
+        file = drawn.with_suffix(".jpg")
+        frame["file_path"] = f"images/{file.name}"
+        exif = Image.Exif()
+        tags: dict[Any, float] = {ExifTags.Base.ExposureTime: 0.01 * 2.0 ** -(index % 2)}
+        tags |= {ExifTags.Base.FNumber: 4.0, ExifTags.Base.ISOSpeedRatings: 100}
+        exif.get_ifd(ExifTags.IFD.Exif).update(tags)
+        Image.open(drawn).save(file, exif=exif, quality=98)
+    path.write_text(json.dumps(meta))
+    return parser
+
+
+def test_exif_serves_without_points(tmp_path: Path, monkeypatch: Any):
+    monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))
+    config = configure(tmp_path / "out", with_exif(tmp_path / "data", "exif"), 2)
+    pipeline = set_up(config).pipeline
+    table = pipeline.model.exposure
+    assert table is not None and len(table.points) == 0
+    steps = table.stops[:, 0] - table.stops[:, 0].roll(1)
+    assert (
+        set(table.stops.unique().round(decimals=3).tolist()) <= {-1.0, -0.5, 0.0, 0.5, 1.0} and steps.abs().max() == 1
+    )
+    pipeline.eval()
+    assert "gain_psnr" in pipeline.get_average_eval_image_metrics()
+
+
+def test_a_line_says_if_exif_and_points_disagree(exposed: Path, tmp_path: Path, monkeypatch: Any, capsys: Any):
+    stops = iter(np.linspace(-8, -5, VIEWS - 2))
+    monkeypatch.setattr(exposure_start, "exposures_of", lambda files: [float(next(stops)) for _ in files])
+    model = set_up(run_of(exposed, tmp_path)).pipeline.model
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "By EXIF, exposure varies in a range of 3.0 stops, but by the points' colours of 1.5" in printed
+    assert model.exposure is not None
+    np.testing.assert_allclose(model.exposure.stops.mean(dim=1), training_stops(), atol=0.1)
