@@ -107,8 +107,8 @@ class SadgsModelConfig(InstantiateConfig):
     A longer one that lies beside a view can cover it with haze; 0 sets no limit."""
     color_model: Literal["none", "affine"] = "none"
     """Whether a colour matrix of each training photo is learned; held-out views are rendered without one."""
-    exposure: Literal["auto", "off"] = "auto"
-    """Whether photos are compared with renderings at their own exposure if exposure varies between them.
+    exposure: Literal["auto", "off"] = "off"
+    """Whether photos are compared with renderings at their own exposure if exposure varies between them ("auto").
     Their gains come from the colours of common SfM points, or from EXIF. The splat has the median exposure."""
     color_corrected_metrics: Suppress[bool] = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
@@ -116,7 +116,7 @@ class SadgsModelConfig(InstantiateConfig):
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""
         near = self.near_plane
-        is_near_plane = near in ("viewers", "scene", None)  # Runs of before have None for "scene".
+        is_near_plane = near in ("viewers", "scene", None)  # Runs of version 1.0.0 have None for "scene".
         if not is_near_plane:
             is_near_plane = not isinstance(near, str) and 0 < near < math.inf
         stereo = self.stereo_points

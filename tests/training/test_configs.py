@@ -357,7 +357,7 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
     model.averaged_share = model.max_angular_scale = 0.0
     model.near_plane = "scene"
-    model.stereo_points, model.clear_paths, model.exposure = 0, False, "off"
+    model.stereo_points, model.clear_paths = 0, False
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
     model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900

@@ -14,7 +14,7 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training.config import SadgsPipelineConfig, SadgsTrainerConfig
+from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.memory_plan import fit_to_memory, training_size
 from sadgs_ns.training.run.progress import cpu_notice, note, warn
@@ -29,14 +29,15 @@ LEAST_PIXELS = 1.5e6
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
-def decide_near_plane(option: str | float | None, of_scene: float, before: RunPlan | None) -> float:
+def decide_near_plane(config: SadgsModelConfig, of_scene: float, before: RunPlan | None) -> float:
     """Return the depth from which Gaussians are drawn.
 
     Args:
-        option: The model's option; in runs of before None stood for "scene".
+        config: The model's options. In runs of version 1.0.0 None stood for "scene".
         of_scene: What `near_plane_of_scene` returned.
         before: Plan of the checkpoint's run. Its depth is kept unless the option is a number.
     """
+    option = config.near_plane
     if option is not None and not isinstance(option, str):
         return option
     if before is not None:

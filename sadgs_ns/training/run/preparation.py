@@ -48,7 +48,7 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     if resumed is not None:
         before = resumed.plan
     of_scene = near_plane_of_scene(pipeline)
-    near_plane = decide_near_plane(pipeline.model.config.near_plane, of_scene, before)
+    near_plane = decide_near_plane(pipeline.model.config, of_scene, before)
     if resumed is None:
         start_with_gains(pipeline, world)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
