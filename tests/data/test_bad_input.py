@@ -1020,6 +1020,21 @@ def test_an_orientation_that_a_size_tells_of_is_no_warning(copied: Callable[[str
         assert sum("EXIF orientation" in finding.sentence for finding in remarks(data)) == told
 
 
+@pytest.mark.hard_case("masks that hide nothing in any image", "a warning")
+@pytest.mark.parametrize("color", [255, 1])
+def test_masks_that_hide_nothing_are_told(color: int, copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    mask("L", color)(data)
+    (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert finding.severity == "warning"
+    problem = f"{data}/transforms.json has 10 masks that hide nothing, such as {data}/mask.png"
+    assert finding.sentence.startswith(f"{problem}: make black what is to be hidden")
+    with Image.open(data / "mask.png") as image:
+        image.putpixel((3, 3), 0)
+        image.save(data / "mask.png")
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+
+
 @pytest.mark.hard_case("several bad images", "one sentence for each kind: the first, and how many more")
 def test_several_problems_of_one_kind_are_one_finding_and_other_kinds_are_counted(copied: Callable[[str], Path]):
     data = copied("nerfstudio")

@@ -789,6 +789,20 @@ def test_the_brighter_colour_of_a_mask_is_white(bright: tuple[int, int, int], tm
         assert not white[:, : 40 + i].any() and (white[:, 40 + i :] == 255).all()
 
 
+@pytest.mark.hard_case("photos' masks in which black is 16, in 8 or 16 bits", "black is hidden")
+@pytest.mark.parametrize(("kind", "unit"), [(np.uint8, 1), (np.uint16, 256)])
+def test_a_mask_s_black_need_not_be_0(kind: type, unit: int, tmp_path: Path):
+    values = np.full((HEIGHT, WIDTH), 235 * unit, kind)
+    values[:, :40] = 16 * unit
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    photo = Photo("a.png", (WIDTH, HEIGHT), (), False)
+    for name, num_hiding in (("mask.png", 1), ("white.png", 0)):
+        Image.new("L", photo.size, 255).save(tmp_path / "white.png")
+        assert write_masks(tmp_path, {"a.png": name}, [photo], [photo], tmp_path / name[:4]) == num_hiding
+    with Image.open(tmp_path / "mask" / "a.png.png") as mask:
+        assert (np.asarray(mask) == np.where(values > 128 * unit, 255, 0)).all()
+
+
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")
 def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
     for name, height in (("pano.png", 0), ("mask.png", 64)):
