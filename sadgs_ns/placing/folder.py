@@ -20,6 +20,7 @@ from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings
 from sadgs_ns.placing.bands import other_bands
+from sadgs_ns.placing.video import is_archive
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
@@ -54,6 +55,9 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
                 unused.append(f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3.")
             return videos, True, {}, [*unused, *others]
         problem = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        archives = [name for name in _visible_files(source) if is_archive(source / name)]
+        if archives:
+            problem += f" It holds archives ({len(archives)}, such as {archives[0]}): unpack them."
         raise InputError(" ".join([problem, *others]))
     for name in photos:
         if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.

@@ -56,7 +56,7 @@ from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_ma
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.placing.scene import Scene
-from sadgs_ns.placing.video import sharpest_frames, video_frames
+from sadgs_ns.placing.video import count_frames, sharpest_frames, video_frames
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.worker import Worker
 
@@ -390,6 +390,33 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
     printed = capsys.readouterr().err
     assert sentence in printed and printed.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case("a ZIP or tar of photos, or a folder with one, instead of photos", "refused: unpack it")
+@pytest.mark.parametrize("kind", ["zip", "tar", "gztar"])
+def test_an_archive_of_photos_is_no_video(kind: str, tmp_path: Path, capsys):
+    """FFmpeg takes an archive in which JPEGs are stored for a video of these."""
+    (tmp_path / "photos").mkdir()
+    for i, photo in enumerate(itertools.islice(draw_photos(), 5)):
+        photo.save(tmp_path / "photos" / f"{i}.jpg")
+    archive = Path(shutil.make_archive(str(tmp_path / "archives" / "photos"), kind, tmp_path / "photos"))
+    assert main([str(archive), str(tmp_path / "out")]) == 2
+    sentence = f"{archive} is an archive: unpack it, and give the folder of its photos or videos."
+    assert capsys.readouterr().err == f"sadgs-process: {sentence}\n"
+    assert main([str(archive.parent), str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case("a single photo, or a text, instead of photos", "refused")
+def test_what_ffmpeg_alone_takes_for_a_video_is_none(tmp_path: Path):
+    photo = next(iter(draw_photos()))
+    (tmp_path / "a.txt").write_text("a letter\n" * 1000)
+    for name, problem in (("a.jpg", "is a single image"), ("a.png", "is a single image"), ("a.txt", "it is a text")):
+        if not (tmp_path / name).exists():
+            photo.save(tmp_path / name)
+        with pytest.raises(InputError, match=problem):
+            count_frames(tmp_path / name)
 
 
 def heic(folder: Path) -> None:
