@@ -12,6 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
+from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
 from scipy.spatial import KDTree
@@ -364,6 +365,8 @@ class SadgsModel(SplatfactoModel):
         check_camera_types(camera)
         pinhole = self.pinhole(camera)
         background = self.background
+        if renderers.BACKGROUND_COLOR_OVERRIDE is not None:  # A crop box has a colour of its own.
+            background = renderers.BACKGROUND_COLOR_OVERRIDE.to(background)
         rows = self.shown_rows(chosen)
         if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
@@ -377,10 +380,15 @@ class SadgsModel(SplatfactoModel):
         }
 
     def pinhole(self, camera: Cameras) -> Pinholes:
-        """Return nerfstudio's camera, shape [1], as the rasterizer takes it."""
-        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds).to(self.device)
+        """Return nerfstudio's camera, shape [1], as the rasterizer takes it; raise InputError if it has no pixel."""
+        # Poses of a camera path may be whole numbers.
+        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds.float()).to(self.device)
         Ks = camera.get_intrinsics_matrices().to(self.device)
-        return Pinholes(viewmats, Ks, int(camera.width.item()), int(camera.height.item()))
+        width = int(camera.width.item())
+        height = int(camera.height.item())
+        if width < 1 or height < 1:
+            raise InputError(f"A picture of {width} × {height} px was asked for: give the camera path a larger size.")
+        return Pinholes(viewmats, Ks, width, height)
 
     @torch.no_grad()
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -418,6 +426,13 @@ class SadgsModel(SplatfactoModel):
             return outputs
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
+        alpha = outputs["accumulation"]
+        seen = outputs[output_name] - (1 - alpha) * outputs["background"]
+        color = torch.where(alpha > 0, seen / alpha, 0.0)
+        return torch.cat([color.clamp(0.0, 1.0), alpha], dim=-1)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""
