@@ -6,6 +6,7 @@ import copy
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -43,6 +44,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
             splits.check_paths(dataset.image_filenames)
             dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
             _check_sizes(dataset)
+            if type(self).setup_train.__module__ == "nerfstudio.scripts.render":  # `ns-render dataset` replaces it.
+                _check_stems(dataset.image_filenames)
 
     def create_eval_dataset(self) -> InputDataset:
         """Make the dataset without reading the points again; nothing uses them."""
@@ -92,6 +95,18 @@ def _check_names(config: FullImageDatamanagerConfig, parser: ColmapDataParserCon
     if source.is_file():
         names = (name for name, _, _ in colmap.read_poses(source))
         splits.check_names(names, source)
+
+
+def _check_stems(names: Sequence[Path]) -> None:
+    """Raise InputError for images that differ in their suffix alone: `ns-render` would write one file for both."""
+    first_of: dict[Path, Path] = {}
+    for name in names:
+        first = first_of.setdefault(name.with_suffix(""), name)
+        if first != name:
+            raise InputError(
+                f"{first} and {name} differ in their suffix alone, so that `ns-render dataset` would write one over "
+                "the other: give one another name, there and in its poses."
+            )
 
 
 def _place(data: dict[str, Any], where: str, device: torch.device) -> dict[str, Any]:

@@ -25,7 +25,9 @@ from PIL import Image
 
 from helpers.forked_python import HANGS
 from helpers.kill_and_resume import configure
-from helpers.short_runs import train
+from helpers.short_runs import configure as short_run
+from helpers.short_runs import nerfstudio_data, train
+from helpers.small_scenes import VIEWS
 from sadgs_ns import errors
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.model import SadgsModel
@@ -210,6 +212,33 @@ def test_opacity_and_the_colour_of_a_crop_are_drawn(run: tuple[int, Path], tmp_p
     assert said is not None and said.startswith(
         "--render-nearest-camera does not work with methods that train on whole"
     )
+
+
+@pytest.mark.hard_case("`ns-render dataset` of images `a/000.png` and `b/000.png`", "a file for each, in its folder")
+@pytest.mark.hard_case("`ns-render dataset` of images `000.png` and `000.jpg`", "refused before rendering")
+@pytest.mark.parametrize("names", [("a/000.png", "b/000.png"), ("000.png", "000.jpg")])
+def test_no_rendering_replaces_another(names: tuple[str, str], tmp_path: Path):
+    data = tmp_path / "data"
+    parser: Any = nerfstudio_data(data)
+    parser.eval_mode = "all"
+    described = json.loads((data / "transforms.json").read_text())
+    for frame, name in zip(described["frames"], names, strict=False):
+        (data / "images" / name).parent.mkdir(exist_ok=True)
+        with Image.open(data / frame["file_path"]) as image:
+            image.load()
+        frame["file_path"] = f"images/{name}"
+        image.save(data / frame["file_path"])
+    (data / "transforms.json").write_text(json.dumps(described))
+    file = write_config(train(short_run(tmp_path / "out", parser, iterations=1)).config)
+    command = DatasetRender(load_config=file, output_path=tmp_path / "views", rendered_output_names=["rgb"])
+    if names[0].startswith("a"):
+        command.main()
+        written = [path.relative_to(tmp_path / "views/test/rgb") for path in (tmp_path / "views").rglob("*.jpg")]
+        assert len(written) == VIEWS and {Path("a/000.jpg"), Path("b/000.jpg")} <= {*written}
+    else:
+        with pytest.raises(InputError, match=r"/000\.(jpg|png) and \S+/000\.(jpg|png) differ in their suffix alone"):
+            command.main()
+        assert not (tmp_path / "views").exists()
 
 
 @pytest.mark.hard_case(
