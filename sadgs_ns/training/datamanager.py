@@ -41,6 +41,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = requested
         for dataset in (self.train_dataset, self.eval_dataset):
+            _make_paths(dataset)
             splits.check_paths(dataset.image_filenames)
             dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
             _check_sizes(dataset)
@@ -95,6 +96,14 @@ def _check_names(config: FullImageDatamanagerConfig, parser: ColmapDataParserCon
     if source.is_file():
         names = (name for name, _, _ in colmap.read_poses(source))
         splits.check_names(names, source)
+
+
+def _make_paths(dataset: InputDataset) -> None:
+    """Make paths of the names of images and masks, which some parsers give as texts."""
+    outputs = dataset._dataparser_outputs
+    outputs.image_filenames = [Path(name) for name in outputs.image_filenames]
+    if outputs.mask_filenames is not None:
+        outputs.mask_filenames = [Path(name) for name in outputs.mask_filenames]
 
 
 def _check_stems(names: Sequence[Path]) -> None:
