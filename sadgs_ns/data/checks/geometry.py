@@ -6,6 +6,7 @@ import math
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +47,13 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
         findings += _check_camera(camera, where)
     yield from findings
     return all(finding.severity != "error" for finding in findings)
+
+
+def check_times(times: Sequence[Any], source: object) -> Iterator[Finding]:
+    """Warn of views that a source gives different times, since training takes all as of one moment."""
+    if len({str(time) for time in times}) > 1:
+        problem = f"{source} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
+        yield warning(f"{problem}: what moves will blur, so keep the frames of one time if you can.")
 
 
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
