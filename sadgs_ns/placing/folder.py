@@ -25,6 +25,7 @@ from sadgs_ns.placing.video import is_archive
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+_LONGEST_NAME = 255 - len(".jpg.png")  # Bytes of a name to which a conversion and its mask add these suffixes
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
@@ -60,6 +61,9 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
             problem += f" It holds archives ({len(archives)}, such as {archives[0]}): unpack them."
         raise InputError(" ".join([problem, *others]))
     for name in photos:
+        if any(len(os.fsencode(part)) > _LONGEST_NAME for part in name.split("/")):
+            problem = f"{source} holds a photo with a name of more than {_LONGEST_NAME} bytes, {name}"
+            raise InputError(f"{problem}: rename it, since its mask and its copies have longer names.")
         if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
     return photos, False, masks, others

@@ -830,6 +830,22 @@ def test_a_mask_s_black_need_not_be_0(kind: type, unit: int, tmp_path: Path):
         assert (np.asarray(mask) == np.where(values > 128 * unit, 255, 0)).all()
 
 
+@pytest.mark.hard_case("photos with names of 248 bytes and more", "refused by name before any work")
+def test_a_name_that_leaves_no_room_for_a_suffix_is_refused(tmp_path: Path, capsys):
+    """A conversion and its mask have the suffixes .jpg.png more, and the file system ends at 255 bytes."""
+    for length, name in ((247, "a" * 243 + ".png"), (248, "é" * 122 + ".png")):
+        photos = tmp_path / str(length)
+        black(photos, name, "b.png", "c.png")
+        assert len(os.fsencode(name)) == length
+        if length == 247:
+            assert name in find_source(photos, tmp_path / "out")[0]
+        else:
+            assert main([str(photos), str(tmp_path / "out")]) == 2
+            sentence = f"{photos} holds a photo with a name of more than 247 bytes, {name}: rename it, since its mask"
+            assert f"sadgs-process: {sentence} and its copies have longer names.\n" == capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")
 def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
     for name, height in (("pano.png", 0), ("mask.png", 64)):
