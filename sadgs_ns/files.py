@@ -20,6 +20,16 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.E
 folder allows."""
 
 
+def check_encoding(path: Path) -> None:
+    """Raise InputError if a path is not in UTF-8: COLMAP, FFmpeg and torch cannot open what lies there, or crash."""
+    absolute = os.path.abspath(path)
+    try:
+        absolute.encode()
+    except UnicodeEncodeError:
+        problem = f"{absolute!a} is not in UTF-8"
+        raise InputError(f"{problem}, which COLMAP, FFmpeg and torch need: rename its folder or file.") from None
+
+
 @contextmanager
 def atomic_path(path: Path, beside: Path | None = None) -> Iterator[Path]:
     """Give a temporary path that becomes `path` when the block ends, and is removed when the block raises.

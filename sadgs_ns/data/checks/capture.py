@@ -22,6 +22,7 @@ from sadgs_ns.data.layouts import ParserOptions
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.files import check_encoding
 
 CHECKS = {
     ColmapDataParserConfig: check_colmap,
@@ -39,6 +40,7 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
     choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
+    check_encoding(data)
     names = [field.name for field in fields(ParserOptions) if hasattr(parser, field.name)]
     options = ParserOptions(**{name: getattr(parser, name) for name in names})
     for kind, check in CHECKS.items():

@@ -14,7 +14,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.data.checks.capture import check_ahead
 from sadgs_ns.errors import InputError, WriteError, reason
-from sadgs_ns.files import atomic_path, lock_folder
+from sadgs_ns.files import atomic_path, check_encoding, lock_folder
 from sadgs_ns.training.options import drop_unknown
 from sadgs_ns.training.run import checkpoints, processes
 from sadgs_ns.training.run.progress import warn
@@ -28,6 +28,9 @@ def begin(config: TrainerConfig) -> None:
     The folder stays locked until `release`, or until this process ends, so that no other run writes there.
     A warning names options of a loaded `config.yml` that this version does not have, and the new one leaves them out.
     """
+    for path in (config.get_base_dir(), config.load_dir, config.load_checkpoint):
+        if path is not None:
+            check_encoding(path)
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():
