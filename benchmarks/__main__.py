@@ -128,6 +128,8 @@ class Benchmark:
     """times are only comparable with 1"""
     only: str = ""
     """regular expression: only runs whose scene/label/seed match"""
+    aligned: bool = False
+    """also measure held-out views after aligning their cameras on the frozen Gaussians, 60 steps each"""
     gate: Path | None = None
     """baseline in JSON: exit with 1 if results are worse"""
     reference: str | None = None
@@ -142,6 +144,8 @@ class Benchmark:
             jobs = [j for j in chosen.jobs() if re.search(self.only, f"{j.scene.name}/{j.row.label}/{j.seed}")]
         except re.error as error:
             raise ValueError(f"--only {self.only!r} is not a regular expression ({error}).") from error
+        if self.aligned:
+            jobs = [dataclasses.replace(job, row=dataclasses.replace(job.row, aligned=True)) for job in jobs]
         if not jobs:
             raise ValueError(f"--only {self.only!r} leaves no run; it is searched for in scene/label/seed.")
         if self.jobs_per_gpu < 1:

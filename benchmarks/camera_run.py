@@ -25,6 +25,7 @@ from benchmarks.cameras import VARIANTS, Job, Photos
 from benchmarks.run import software
 from sadgs_ns.placing import reconstruct
 from sadgs_ns.placing.adjustment import adjust_robustly, filter_observations, robust_options
+from sadgs_ns.placing.agreement import Observed, displacement
 from sadgs_ns.placing.features import extract
 from sadgs_ns.placing.plan import choose_matching
 
@@ -154,10 +155,10 @@ def measure_capture(job: Job, photos: Photos, work: Path) -> dict[str, dict[str,
 
 def compare_pairs(models: Sequence[pycolmap.Reconstruction], seeds: Sequence[int]) -> list[dict[str, Any]]:
     """Return the displacement of points between the models of any two seeds."""
-    observed = [camera_measures.Observed.of(model) for model in models]
+    observed = [Observed.of(model) for model in models]
     pairs = []
     for i, j in itertools.combinations(range(len(models)), 2):
-        moved = camera_measures.displacement(observed[i], observed[j])
+        moved = displacement(observed[i], observed[j])
         pairs.append({"seeds": [seeds[i], seeds[j]], **dataclasses.asdict(moved)})
     return pairs
 

@@ -56,6 +56,8 @@ class Row:
     """Which seeds; None means the protocol's."""
     curve_every: int | None = None
     """Iterations between measurements of the held-out views within a run; None makes none."""
+    aligned: bool = False
+    """Whether held-out views are also measured after their cameras were aligned (alignment.py); `--aligned` sets it."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ class Job:
         settings: list[Any] = [self.row.method, self.row.overrides, dataclasses.asdict(self.scene)]
         if self.row.curve_every is not None:  # a finished run without the curve is not what is asked for
             settings.append(self.row.curve_every)
+        if self.row.aligned:
+            settings.append("aligned")
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()[:12]
         return f"{self.scene.name}/{self.row.label}/{self.seed}/{digest}"
 

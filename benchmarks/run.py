@@ -126,7 +126,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         if not processes.is_rank_zero():
             return {}
         trainer = load_in_one_process(job, root, work, trainer.checkpoint_dir)
-    record = {"devices": devices, **measure(trainer, timer, seconds)}
+    record = {"devices": devices, **measure(trainer, timer, seconds, job.row.aligned)}
     if curve is not None:
         end = point(record["iterations"], timer.seconds, record, record["gaussians"])
         record["curve"] = [*curve.points, end]
@@ -220,7 +220,7 @@ def train(
     return trainer, timer, curve
 
 
-def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[str, Any]:
+def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float], aligned: bool = False) -> dict[str, Any]:
     """Evaluate a trained model on the held-out views; return all of `run_row` but `devices` and `curve`."""
     import torch
 
@@ -231,8 +231,13 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float]) -> dict[s
     model = pipeline.model
     pipeline.eval()
     views = datamanager.fixed_indices_eval_dataloader
-    held_out = evaluate.quality(model, views, evaluate.load_lpips())
+    network = evaluate.load_lpips()
+    held_out = evaluate.quality(model, views, network)
     held_out["ply_view_psnr"] = evaluate.view_psnr_in_viewers(model, views, held_out["view_psnr"])
+    if aligned:
+        from benchmarks.alignment import aligned_quality
+
+        held_out |= aligned_quality(model, views, network)
     differing = viewpoints.pixels_that_differ(model, datamanager.train_dataset.cameras)
     return {
         "iterations": trainer.config.max_num_iterations,

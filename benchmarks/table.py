@@ -202,6 +202,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "cc_psnr": ("PSNR, colours fitted", _spread("cc_psnr", 2)),
     "cc_ssim": ("SSIM, fitted", _spread("cc_ssim", 4)),
     "cc_lpips": ("LPIPS, fitted", _spread("cc_lpips", 4)),
+    "aligned_psnr": ("PSNR, aligned", _spread("aligned_psnr", 2)),
+    "aligned_ssim": ("SSIM, aligned", _spread("aligned_ssim", 4)),
+    "aligned_lpips": ("LPIPS, aligned", _spread("aligned_lpips", 4)),
     "gain_psnr": ("PSNR, photo's gain", _spread("gain_psnr", 2)),
     "gain_ssim": ("SSIM, photo's gain", _spread("gain_ssim", 4)),
     "gain_lpips": ("LPIPS, photo's gain", _spread("gain_lpips", 4)),
@@ -268,7 +271,11 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
             f"The rows of sadgs are of several commits ({', '.join(sorted(commits))}); a run is made again when its "
             "line is deleted."
         )
-    text = of_runs(runs, _PRINTED, strict=False)
+    columns: list[str] = [*_PRINTED]
+    if any(row.get("aligned_psnr") is not None for row in last):
+        place = columns.index("gaussians")
+        columns[place:place] = ["aligned_psnr", "aligned_ssim", "aligned_lpips"]
+    text = of_runs(runs, columns, strict=False)
     return "\n".join([text, *([""] if sentences else []), *(f"- {sentence}" for sentence in sentences)])
 
 

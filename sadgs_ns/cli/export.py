@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -53,7 +53,10 @@ class Export:
     frame: Literal["nerfstudio", "colmap"] = "nerfstudio"
     """Coordinates: nerfstudio's, upright with cameras within ±1, or those of the COLMAP model or transforms.json."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
-    """Folder of the capture, for .html, .mesh.ply, --min-views and --dust; by default where it was in training."""
+    """Folder of the capture, for .html, .mesh.ply, --cameras, --min-views and --dust.
+    By default it is where it was in training."""
+    cameras: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Also write the training cameras to this .json, as transforms.json, with the poses that the run has refined."""
     min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0
     """Take away Gaussians that fewer than K training views see."""
     max_extent: Annotated[float | None, tyro.conf.arg(metavar="UNITS")] = None
@@ -115,10 +118,15 @@ def export(options: Export) -> int:
     if similarity is not None:
         _check_steps(similarity, float(params["scales"].median()))
     cameras = None
-    if is_page or is_mesh or cleaning.needs_views:
+    if is_page or is_mesh or cleaning.needs_views or options.cameras is not None:
         from sadgs_ns.data.run_cameras import read_cameras
 
         cameras = read_cameras(folder, options.data)
+    if cameras is not None and options.cameras is not None:
+        from sadgs_ns.cli.exported_cameras import write_cameras
+
+        _, pipeline = _load(options.run)
+        write_cameras(options.cameras, pipeline, cameras, similarity)
     params = _cleaned(params, cleaning, cameras, drawing)
     if is_mesh and cameras is not None:
         from sadgs_ns.cli.meshing import write_mesh
@@ -148,6 +156,8 @@ def _check(options: Export) -> None:
     voxel_size = options.voxel_size
     if suffix == ".html" and options.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
+    if options.cameras is not None and options.cameras.suffix != ".json":
+        raise InputError(f"--cameras {options.cameras} is for a file that ends in .json: name one.")
     if voxel_size is not None and suffix != MESH:
         raise InputError(f"--voxel-size is for meshes: let --output end in {MESH}, or leave it out.")
     if voxel_size is not None and not 0 < voxel_size < math.inf:
@@ -228,18 +238,8 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     from torch import Tensor
 
     from sadgs_ns.render.types import RenderOptions
-    from sadgs_ns.training.run import checkpoints
 
-    checkpoint = _checkpoint_of(run)
-    if checkpoint == run:
-        chosen = checkpoints.read_chosen(None, None, checkpoint, _REMEDY, mmap=True)
-    else:
-        chosen = checkpoints.read_chosen(checkpoint.parent, None, None, _REMEDY, mmap=True)
-    assert chosen is not None
-    checkpoint, content = chosen
-    loaded = content["pipeline"]
-    if not isinstance(loaded, dict):
-        loaded = {}
+    checkpoint, loaded = _load(run)
     params = {}
     for name in ("means", "scales", "quats", "opacities", "features_dc", "features_rest"):
         value = loaded.get(_PREFIX + name)
@@ -259,6 +259,23 @@ def read_checkpoint(run: Path) -> tuple[dict[str, Tensor], RenderOptions]:
     near_plane = plan.get("near_plane", RenderOptions.near_plane)
     max_off_axis = plan.get("max_off_axis", _MAX_OFF_AXIS)
     return params, RenderOptions(near_plane=near_plane, max_off_axis=max_off_axis)
+
+
+def _load(run: Path) -> tuple[Path, dict[str, Any]]:
+    """Return a run's checkpoint and the state of its pipeline, whose tensors are mapped from the file."""
+    from sadgs_ns.training.run import checkpoints
+
+    checkpoint = _checkpoint_of(run)
+    if checkpoint == run:
+        chosen = checkpoints.read_chosen(None, None, checkpoint, _REMEDY, mmap=True)
+    else:
+        chosen = checkpoints.read_chosen(checkpoint.parent, None, None, _REMEDY, mmap=True)
+    assert chosen is not None
+    checkpoint, content = chosen
+    loaded = content["pipeline"]
+    if not isinstance(loaded, dict):
+        loaded = {}
+    return checkpoint, loaded
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -21,8 +21,27 @@ def camera_positions(cameras: Cameras) -> Tensor:
     return cameras.camera_to_worlds[:, :3, 3].cpu()
 
 
+TRAINING_VIEW = "training_view"
+"""Key in cameras' metadata: the index of the training view that each one is, −1 of others. int64 [C, 1]"""
+
+
+def mark_training_views(cameras: Cameras, names: Sequence[Path], training: Sequence[Path]) -> None:
+    """Note in the metadata of cameras, by their images' names, which training view each one is."""
+    numbers = {name: number for number, name in enumerate(training)}
+    views = torch.tensor([[numbers.get(name, -1)] for name in names], device=cameras.device).view(-1, 1)
+    cameras.metadata = {**(cameras.metadata or {}), TRAINING_VIEW: views}
+
+
+def training_view(camera: Cameras) -> int | None:
+    """Return the index of the training view that a camera, shape [1], is; None if it is none."""
+    number = (camera.metadata or {}).get(TRAINING_VIEW)
+    if not isinstance(number, Tensor) or number.numel() != 1 or int(number) < 0:
+        return None
+    return int(number)
+
+
 def check_camera_types(cameras: Cameras) -> None:
-    """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one.
+    """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one, or that has no pixel.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras with a distortion coefficient other than 0. Others would be rendered wrongly, as pinholes.
@@ -31,6 +50,10 @@ def check_camera_types(cameras: Cameras) -> None:
     for index, number in enumerate(cameras.camera_type.flatten().tolist()):
         camera_type = CameraType(number)
         where = f"Camera {index} is {camera_type.name}"
+        width = int(cameras.width.flatten()[index])
+        height = int(cameras.height.flatten()[index])
+        if min(width, height) < 1:
+            raise InputError(f"Camera {index} has {width} × {height} px: give it, or its path, a larger size.")
         if camera_type in _UNDISTORTED:
             if coefficients is None or not coefficients[index].any():
                 raise InputError(f"{where} {NO_COEFFICIENTS}")

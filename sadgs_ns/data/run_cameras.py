@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,18 @@ from sadgs_ns.errors import InputError, reason
 
 @dataclass(frozen=True)
 class RunCameras:
-    """C pinhole cameras in the frame of training; distortion is left out."""
+    """C cameras in the frame of training, as pinholes; the distortion of their photos is told beside."""
 
     camera_to_worlds: Tensor  # OpenGL axes (x right, y up, z backward). [C, 3, 4]
     Ks: Tensor  # Intrinsics in px. [C, 3, 3]
     sizes: list[tuple[int, int]]  # Widths and heights in px
+    images: list[Path] = field(default_factory=list)  # Their photos
+    distortion: Tensor | None = None  # nerfstudio's coefficients, k1 to k4, p1, p2. [C, 6]
+    camera_model: str = "OPENCV"  # As `transforms.json` names it
 
 
+CAMERA_MODELS = {1: "OPENCV", 2: "OPENCV_FISHEYE", 10: "FISHEYE624"}
+"""Names in `transforms.json` of nerfstudio's types of cameras that training takes."""
 _CLASS = "<class>"  # Key of an object's class in its mapping
 
 
@@ -75,9 +80,9 @@ def _make_parser(settings: Mapping[str, Any], data: Path) -> Any:
     known = {f"{type(parser).__module__}.{type(parser).__qualname__}": parser for parser in PARSERS.values()}
     named = known.get(settings.get(_CLASS, ""), AutomaticDataParserConfig())
     parser: Any = copy.deepcopy(named)
-    for field in fields(parser):
-        if field.name in settings and not field.name.startswith("_"):
-            setattr(parser, field.name, settings[field.name])
+    for option in fields(parser):
+        if option.name in settings and not option.name.startswith("_"):
+            setattr(parser, option.name, settings[option.name])
     parser.data = data
     manager = FullImageDatamanagerConfig(data=data, dataparser=parser)
     choose_parser(manager)
@@ -145,4 +150,11 @@ def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
         poses = to_frame.inverse().poses(poses)
         poses = from_data(run / TRANSFORMS_NAME).poses(poses)
     sizes = [(int(width), int(height)) for width, height in zip(cameras.width, cameras.height, strict=True)]
-    return RunCameras(torch.from_numpy(poses).float(), cameras.get_intrinsics_matrices(), sizes)
+    return RunCameras(
+        camera_to_worlds=torch.from_numpy(poses).float(),
+        Ks=cameras.get_intrinsics_matrices(),
+        sizes=sizes,
+        images=list(outputs.image_filenames),
+        distortion=cameras.distortion_params,
+        camera_model=CAMERA_MODELS[int(cameras.camera_type[0])],
+    )

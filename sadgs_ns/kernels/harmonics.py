@@ -1,7 +1,8 @@
 """Colours of Gaussians from spherical harmonics, instead of gsplat's `spherical_harmonics`.
 
 gsplat takes all coefficients in one tensor, once per view, while the parameters are two tensors, which the views share.
-Here nothing is concatenated or expanded, and the gradients arrive summed over the views.
+Here nothing is concatenated or expanded, and the gradients arrive summed over the views; those by the cameras are sums
+over blocks of Gaussians, which torch adds up.
 """
 
 from __future__ import annotations
@@ -117,12 +118,15 @@ def _add(sums, basis, v):
     do_not_specialize=["n", "start", "num_views", "used", "stride", "row"], do_not_specialize_on_alignment=["v_colors"]
 )
 def _backward(
-    means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, start, num_views, used, stride, row,
-    PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
+    means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_centres,
+    n, start, num_views, used, stride, row,
+    POSES: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
 ):  # fmt: skip
     """Add the gradients of VIEWS views to those of the views before `start`.
 
     Three threads have a Gaussian's three channels, a fourth does nothing. Rows of `v_colors` lie `row` numbers apart.
+    With POSES, also write minus the gradients by the cameras' centres, summed over this program's Gaussians.
+    [C, programs, 3]
     """
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     channel = tl.arange(0, 4)[None, :]
@@ -143,16 +147,18 @@ def _backward(
         v = tl.where(tl.load(colors + 3 * at[:, None] + channel, seen, 0.0) > 0, v, 0.0)
         v_sum += v
         sums = _add(sums, _basis(x, y, z), v)
-        by_x, by_y, by_z = _slopes(x, y, z)
+        slope_x, slope_y, slope_z = _slopes(x, y, z)
         dx = tl.zeros([LANES], tl.float32)
         dy, dz = dx, dx
         for k in tl.static_range(15):
             shade = tl.sum(v * tl.load(rest + at_others + 3 * k, seen & (k < used), 0.0), 1)
-            dx, dy, dz = dx + by_x[k] * shade, dy + by_y[k] * shade, dz + by_z[k] * shade
+            dx, dy, dz = dx + slope_x[k] * shade, dy + slope_y[k] * shade, dz + slope_z[k] * shade
         along = dx * x + dy * y + dz * z
-        v_x += (dx - along * x) * inverse
-        v_y += (dy - along * y) * inverse
-        v_z += (dz - along * z) * inverse
+        by_x, by_y, by_z = (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
+        v_x, v_y, v_z = v_x + by_x, v_y + by_y, v_z + by_z
+        if POSES:
+            part = v_centres + 3 * (tl.cast(view, tl.int64) * tl.num_programs(0) + tl.program_id(0))
+            store3(part, 0, tl.sum(by_x), tl.sum(by_y), tl.sum(by_z), start + i < num_views)
     at_first = 3 * g[:, None] + channel
     v_sum = 0.2820947917738781 * v_sum + tl.load(v_first + at_first, earlier, 0.0)
     tl.store(v_first + at_first, v_sum, mine)
@@ -186,12 +192,28 @@ class _Colors(torch.autograd.Function):
         written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
         v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
         v_colors, row = equally_spaced_rows(v_colors, colors)
+        programs = cdiv(n, _BACKWARD_LANES)
+        moves_cameras = ctx.needs_input_grad[3]
+        sums = means  # The kernel does not read what stands in.
+        if moves_cameras:
+            sums = means.new_empty((num_views, programs, 3))
         for start in range(0, num_views, _VIEWS):
-            _backward[cdiv(n, _BACKWARD_LANES),](
-                means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest,
-                n, start, num_views, ctx.used, rest.shape[1] * 3, row, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
+            _backward[programs,](
+                means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, sums,
+                n, start, num_views, ctx.used, rest.shape[1] * 3, row,
+                moves_cameras, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
             )  # fmt: skip
-        return v_means, v_first, v_rest, None, None, None
+        v_viewmats = None
+        if moves_cameras:
+            v_viewmats = _by_matrices(viewmats, sums.sum(dim=1))
+        return v_means, v_first, v_rest, v_viewmats, None, None
+
+
+def _by_matrices(viewmats: Tensor, v_origins: Tensor) -> Tensor:
+    """Return gradients by matrices (R | t) [C, 4, 4], given those by Rᵀ t, which is minus the centre [C, 3]."""
+    by_rotation = viewmats[:, :3, 3:] * v_origins[:, None]  # [C, 3, 3]
+    by_translation = (viewmats[:, :3, :3] * v_origins[:, None]).sum(dim=2, keepdim=True)  # [C, 3, 1]
+    return torch.nn.functional.pad(torch.cat([by_rotation, by_translation], dim=2), (0, 0, 0, 1))
 
 
 def colors_from_harmonics(
@@ -200,7 +222,7 @@ def colors_from_harmonics(
     """Colours that 3DGS gives Gaussians seen from cameras: max(Σ_k Y_k(direction) · coefficient_k + 0.5, 0). [C, N, 3]
 
     `first` and `rest` are the pair of `render.types.Gaussians.colors`, float32, with coefficients at least up to
-    `degree` ≤ MAX_DEGREE. `viewmats` get no gradient. Where a radius is not positive, the colour means nothing.
+    `degree` ≤ MAX_DEGREE. Where a radius is not positive, the colour means nothing.
     """
     tensors = (value.contiguous() for value in (means, first, rest, viewmats, radii))
     return _Colors.apply(*tensors, (degree + 1) ** 2 - 1)  # type: ignore[return-value]

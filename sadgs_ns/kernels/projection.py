@@ -2,7 +2,8 @@
 
 gsplat's takes eight: it fills gradients with zeros, copies those that compositing gives it as parts of rows, and adds
 with atomic operations. Here each Gaussian's gradients are summed over the views in registers, and what else depends on
-the centres is added on the way. The formulas are those of gsplat 1.4.0 and 1.5.3.
+the centres is added on the way. Gradients by the cameras are sums over blocks of Gaussians, which torch adds up: they
+come out the same each time. The formulas are those of gsplat 1.4.0 and 1.5.3.
 """
 
 from __future__ import annotations
@@ -39,6 +40,15 @@ def _by_row(ratio, slope, inverse, scale, by_first, by_last):
     return by_x, scale * inverse * (slope * by_last - by_first) - slope * by_x
 
 
+@triton.jit
+def _store_row(part, seen, by, mean_x, mean_y, mean_z, first, second, third):
+    """Sum the gradients by one row of a view's matrix, given `by` that of the centre and the rest of the rotation's."""
+    tl.store(part, tl.sum(tl.where(seen, by * mean_x + first, 0.0)))
+    tl.store(part + 1, tl.sum(tl.where(seen, by * mean_y + second, 0.0)))
+    tl.store(part + 2, tl.sum(tl.where(seen, by * mean_z + third, 0.0)))
+    tl.store(part + 3, tl.sum(tl.where(seen, by, 0.0)))
+
+
 # One view's intrinsics may be part of a tensor of several views, and gradients part of rows. They begin at no multiple
 # of 16 bytes, for which Triton would compile another kernel.
 @triton.jit(
@@ -47,13 +57,14 @@ def _by_row(ratio, slope, inverse, scale, by_first, by_last):
 )
 def _project_backward(
     means, quats, scales, viewmats, Ks, radii, conics,
-    v_means2d, v_conics, v_depths, v_passed, v_means, v_quats, v_scales,
+    v_means2d, v_conics, v_depths, v_passed, v_means, v_quats, v_scales, v_poses,
     n, num_views, width, height, row2d, row_conic,
-    DEPTHS: tl.constexpr, PASSED: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
+    DEPTHS: tl.constexpr, PASSED: tl.constexpr, POSES: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients by centres, quaternions and standard deviations, summed over the views.
 
-    Those by the projected centres and by the conics lie `row2d` and `row_conic` numbers apart.
+    Those by the projected centres and by the conics lie `row2d` and `row_conic` numbers apart. With POSES, also write
+    those by the upper three rows of each view's matrix, summed over the Gaussians of this program. [C, programs, 12]
     """
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     exists = g < n
@@ -126,6 +137,15 @@ def _project_backward(
         v_y += tl.where(seen, w01 * by_x + w11 * by_y + w21 * by_z, 0.0)
         v_z += tl.where(seen, w02 * by_x + w12 * by_y + w22 * by_z, 0.0)
         count += seen
+        if POSES:
+            # The rotation turns the centre, and W of T = J W has the gradient Jᵀ 2 H T Σ.
+            row_x, row_y = 2 * jx, 2 * jy
+            back_x, back_y = row_x * slope_x, row_y * slope_y
+            part = v_poses + 12 * (i * tl.cast(tl.num_programs(0), tl.int64) + tl.program_id(0))
+            _store_row(part, seen, by_x, mean_x, mean_y, mean_z, row_x * u00, row_x * u01, row_x * u02)
+            _store_row(part + 4, seen, by_y, mean_x, mean_y, mean_z, row_y * u10, row_y * u11, row_y * u12)
+            last_0, last_1 = -back_x * u00 - back_y * u10, -back_x * u01 - back_y * u11
+            _store_row(part + 8, seen, by_z, mean_x, mean_y, mean_z, last_0, last_1, -back_x * u02 - back_y * u12)
 
     if PASSED:
         x, y, z = load3(v_passed, 3 * g, exists)
@@ -183,20 +203,28 @@ class _Project(torch.autograd.Function):
         # The kernel reads no tensor that stands in for one that is None.
         depths, passed = (conics if value is None else value.contiguous() for value in (v_depths, v_passed))
         n = len(means)
-        _project_backward[cdiv(n, _LANES),](
+        programs = cdiv(n, _LANES)
+        moves_cameras = ctx.needs_input_grad[4]
+        sums = conics
+        if moves_cameras:
+            sums = means.new_empty((len(viewmats), programs, 3, 4))
+        _project_backward[programs,](
             means, quats, scales, viewmats, Ks, radii, conics,
-            v_means2d, v_conics, depths, passed, v_means, v_quats, v_scales,
+            v_means2d, v_conics, depths, passed, v_means, v_quats, v_scales, sums,
             n, len(viewmats), *ctx.size, row2d, row_conic,
-            v_depths is not None, v_passed is not None, radii.dim() - 1, _LANES,
+            v_depths is not None, v_passed is not None, moves_cameras, radii.dim() - 1, _LANES,
         )  # fmt: skip
-        return v_means, v_quats, v_scales, *[None] * 6
+        v_viewmats = None
+        if moves_cameras:
+            v_viewmats = torch.nn.functional.pad(sums.sum(dim=1), (0, 0, 0, 1))
+        return v_means, v_quats, v_scales, None, v_viewmats, *[None] * 4
 
 
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do what `gsplat_compat.project` does, but with one kernel backward. Opacities and cameras get no gradient.
+    """Do what `gsplat_compat.project` does, but with one kernel backward. Opacities and `Ks` get no gradient.
 
     Returns:
         The results of `gsplat_compat.project`, whose radii may be set to 0 in place until the backward pass; and

@@ -16,6 +16,12 @@ LOSS_SCALE = 1.0  # Residual in px from which an observation counts as if it wer
 _MOST_ERROR = 4.0  # Largest residual in px of an observation that is kept; COLMAP's
 _LEAST_ANGLE = 1.5  # Least angle in degrees at which a point is seen; COLMAP's
 _MOST_ITERATIONS = 50
+_FIRM = 400
+"""Observations a photo from which a model counts as firm. Of the captures that are placed alike by all samples each has
+700 or more, and lund, whose models differed by up to 16 % of a photo's side, has 190."""
+_SETTLING_ROUNDS = 3  # After them no model of lund changed
+_SETTLING_ITERATIONS = 200
+_SETTLING_TOLERANCE = 1e-6
 _TOLERANCE = 1e-3
 """Relative change of the cost at which the adjustment ends. With 1e-5 points move by as little between samples, in two
 to seven times the time."""
@@ -33,12 +39,9 @@ def refine(model: pycolmap.Reconstruction, database: Path, options: pycolmap.Inc
         database: The features and matches, with cameras of the model's kinds.
         options: Those by which the photos were placed.
     """
-    with pycolmap.Database.open(database) as opened:
-        chosen = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
-        cache = pycolmap.DatabaseCache.create(opened, chosen)
+    mapper = _open_mapper(database, options)
     mapper_options = options.get_mapper()
     mapper_options.ba_global_ignore_redundant_points3D = False
-    mapper = pycolmap.IncrementalMapper(cache)
     mapper.begin_reconstruction(model)
     mapper.iterative_global_refinement(
         1,
@@ -53,6 +56,53 @@ def refine(model: pycolmap.Reconstruction, database: Path, options: pycolmap.Inc
         mapper.triangulate_image(options.get_triangulation(), image_id)
     mapper.end_reconstruction(discard=False)
     filter_observations(model)  # Some of those that were triangulated again are wrong.
+
+
+def _open_mapper(database: Path, options: pycolmap.IncrementalPipelineOptions) -> pycolmap.IncrementalMapper:
+    """Return COLMAP's mapper of the features and matches of a database."""
+    with pycolmap.Database.open(database) as opened:
+        chosen = pycolmap.DatabaseCacheOptions(min_num_matches=options.min_num_matches)
+        cache = pycolmap.DatabaseCache.create(opened, chosen)
+    return pycolmap.IncrementalMapper(cache)
+
+
+def is_firm(model: pycolmap.Reconstruction) -> bool:
+    """Tell whether a model has so many observations that it comes out alike whatever the random samples."""
+    return model.compute_num_observations() >= _FIRM * model.num_reg_frames()
+
+
+def settle(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    fixed_cameras: Collection[int] = (),
+) -> None:
+    """Adjust a model that is not firm until nothing changes, and triangulate again in between.
+
+    Few observations let the focal length and the scale along a walk slide together at hardly any cost, so an adjustment
+    that ends early ends anywhere between. Of lund's 29 photos, models of 29 seeds came out with focal lengths of 840 to
+    1,103 px and 4,549 to 5,687 observations; ten of them, settled, with 853 to 900 px and 5,655 to 5,778.
+
+    Args:
+        model: Changed in place. `adjust_robustly` is to follow.
+        database: The features and matches.
+        options: Those by which the photos were placed.
+        fixed_cameras: Cameras whose intrinsics stay.
+    """
+    adjustment = robust_options()
+    adjustment.ceres.solver_options.max_num_iterations = _SETTLING_ITERATIONS
+    adjustment.ceres.solver_options.function_tolerance = _SETTLING_TOLERANCE
+    mapper = _open_mapper(database, options)
+    triangulation = options.get_triangulation()
+    for _ in range(_SETTLING_ROUNDS):
+        adjust_robustly(model, fixed_cameras, options=adjustment)
+        mapper.begin_reconstruction(model)
+        mapper.complete_and_merge_tracks(triangulation)
+        mapper.retriangulate(triangulation)
+        for image_id in model.reg_image_ids():
+            mapper.triangulate_image(triangulation, image_id)
+        mapper.end_reconstruction(discard=False)
+        filter_observations(model)
 
 
 def adjust_robustly(

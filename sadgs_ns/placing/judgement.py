@@ -3,8 +3,9 @@
 Photos without parallax, or by lenses that the camera model does not fit, may all register and still give a wrong model.
 Sound captures keep far from the limits below. Ten real ones have angles of view of 35 to 79°, focal lengths that differ
 by at most 8 %, 116 points or more in the median photo, 5° or more between two rays to the median point, and shifts of
-1.4 % or more. Of photos by a camera that turns on the spot, COLMAP often makes a model with large angles between rays,
-but too narrow a view; the shift alone tells it.
+1.4 % or more; two placings of those that few points hold together differ by at most 1.7 %. Of photos by a camera that
+turns on the spot, COLMAP often makes a model with large angles between rays, but too narrow a view; the shift alone
+tells it.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ class Measures:
     observations: float  # Points that the median photo shows
     parallax: float  # Largest angle in degrees between two rays to a point, of the median point
     shift: float  # What turning leaves unexplained of the way of points between photos, as a share of the longer side
+    disagreement: float = math.nan
+    """How far points move between two placings of the photos with other samples, as a share of the longer side. The two
+    are the most alike of up to three; NaN if there is one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +87,11 @@ def _turned(shift: float) -> str:
     return f"the photos look as if the camera had turned on the spot, to {100 * shift:.2f} % of their size: {_MOVE}"
 
 
+def _unlike(share: float) -> str:
+    problem = "few points hold the photos together, and placed again with other random samples"
+    return f"{problem} they move by {100 * share:.2g} % of a photo's size: take more photos in between"
+
+
 CRITERIA = (
     Criterion("widest", 120.0, 130.0, _wide),
     Criterion("narrowest", 6.0, 2.0, _narrow),
@@ -90,6 +99,7 @@ CRITERIA = (
     Criterion("observations", 40.0, 15.0, _few_points),
     Criterion("parallax", 2.5, 1.8, _flat),
     Criterion("shift", 0.004, 0.0025, _turned),
+    Criterion("disagreement", 0.02, 0.05, _unlike),
 )
 """What a model is judged by. A circular fisheye of 200° comes out at 120°. Anamorphic lenses squeeze pictures by two at
 most. COLMAP drops points that are seen within 1.5°, so a median little above it says that most points were dropped."""

@@ -16,6 +16,14 @@ _VIEW_NAME = re.compile(r"(.+\.[a-z]\w{2,3})/[0-7]\.(jpg|png)", re.IGNORECASE)
 _PITCH = 22.5
 """Degrees above and below the horizon. The views show latitudes up to 60°, and none over 68°, where a tripod is."""
 
+_CIRCLE = 128  # Side in px to which each half of a photo is reduced to look for circles
+_MOST_UNEVEN = 0.02  # Largest difference between the width and twice the height, as a share of the width
+_DARK = 40  # Largest value of what is outside of a circle; flares reach beyond its rim
+_OUTSIDE = 1.2  # Radius outside of all lenses' circles, in halves of the height: the corners
+_RIM = (0.7, 0.9)  # Radii inside of all lenses' circles, near their rim
+_MOST = 0.95  # Least share of what is outside that is dark
+_LEAST_BRIGHT = 0.4  # Least share of the rim that is not
+
 
 def rotations() -> np.ndarray:
     """Return the rotations from a view's axes (x right, y down, z forward) to those of its panorama. [VIEWS, 3, 3]"""
@@ -48,6 +56,25 @@ def is_panorama(image: Image.Image, size: tuple[int, int]) -> bool:
     steps = np.abs(np.diff(small, axis=1))
     poles = steps[[0, -1]].mean(1).max()  # Each is one point.
     return bool(max(seam / 3, 4 * poles) < steps.mean() and small[:, 0].std() > 0.1 * small.std())
+
+
+def is_fisheye_pair(image: Image.Image, size: tuple[int, int]) -> bool:
+    """Return whether a photo of this size in px shows two fisheye circles side by side, as 360° cameras store them.
+
+    Nearly all outside of the two circles is dark, and most along their rims is not. Of a panorama by night, whose sky
+    and floor are dark, the rims are dark, too.
+    """
+    width, height = size
+    if abs(width - 2 * height) > _MOST_UNEVEN * width:
+        return False
+    small = image.convert("L").resize((2 * _CIRCLE, _CIRCLE), Image.Resampling.BOX)
+    halves = np.asarray(small).reshape(_CIRCLE, 2, _CIRCLE)
+    across = (np.arange(_CIRCLE) + 0.5) / _CIRCLE * 2 - 1
+    radius = np.hypot(*np.meshgrid(across, across))  # 1 at the middle of a half's edges [_CIRCLE, _CIRCLE]
+    is_dark = (halves <= _DARK).transpose(1, 0, 2)
+    outside = is_dark[:, radius > _OUTSIDE].mean(axis=1)
+    rim = is_dark[:, (radius > _RIM[0]) & (radius < _RIM[1])].mean(axis=1)
+    return bool(outside.min() > _MOST and rim.max() < 1 - _LEAST_BRIGHT)
 
 
 def cut(panorama: Image.Image) -> list[Image.Image]:

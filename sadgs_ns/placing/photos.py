@@ -21,12 +21,13 @@ from sadgs_ns.host_memory import available_host_bytes
 from sadgs_ns.placing.bit_depth import largest_value
 from sadgs_ns.placing.colours import profile_of
 from sadgs_ns.placing.folder import COLMAP_FORMATS
-from sadgs_ns.placing.panoramas import VIEWS, is_panorama
+from sadgs_ns.placing.panoramas import VIEWS, is_fisheye_pair, is_panorama
 
 _FOCAL_LENGTHS = (ExifTags.Base.FocalLength, ExifTags.Base.FocalLengthIn35mmFilm, ExifTags.Base.DigitalZoomRatio)
 """Of a phone's digital zoom one of the last two alone tells, by its make."""
 _NO_FOCAL_LENGTH = ("None", "nan")  # A focal length in `Photo.camera` that EXIF does not tell
 _LARGE_FOLDER = 10  # Least number of photos of a folder that has a camera of its own
+_PAIRS_SHARE = 0.5  # Share of the photos that look like pairs of fisheye circles from which they are refused
 _NAMED = 20  # How many unreadable photos a message names
 
 
@@ -41,6 +42,7 @@ class Photo:
     is_read: bool = True  # Whether COLMAP reads its format, and its colours need no conversion
     is_turned: bool = False  # Whether EXIF says that the pixels are to be turned or mirrored to be upright
     is_panorama: bool = False
+    is_fisheye_pair: bool = False  # Whether it shows two fisheye circles, of which no panorama was made yet
     has_focal_length: bool = False  # Whether EXIF tells one
     largest_value: int | None = None  # Of its colours if its file has more than 8 bits a value
     bit_depth: int | None = None  # Bits that its values use if these are to be scaled
@@ -83,6 +85,9 @@ def read_photos(folder: Path, names: Sequence[str], report: Callable[[str, int, 
             report("photos", done, len(names))
     if broken:
         raise InputError(_explain_broken(folder, broken, len(names)))
+    pairs = [photo.name for photo in photos if photo.is_fisheye_pair]
+    if len(pairs) >= _PAIRS_SHARE * len(photos) > 0:
+        raise InputError(_explain_fisheye_pairs(folder, pairs, len(names)))
     looks: dict[tuple[int, int], list[bool]] = defaultdict(list)
     for photo in photos:
         looks[photo.size].append(photo.is_panorama)
@@ -101,6 +106,13 @@ def _explain_broken(folder: Path, broken: Sequence[str], total: int) -> str:
         them = "it"
     problem = f"{len(broken)} of the {total} photos in {folder} cannot be read as a whole image"
     return f"{problem}: {', '.join(shown)}; copy {them} again or remove {them}."
+
+
+def _explain_fisheye_pairs(folder: Path, pairs: Sequence[str], total: int) -> str:
+    """Return the sentence on photos that are pairs of fisheye circles, given their names."""
+    found = f"{len(pairs)} of the {total} photos in {folder}, such as {pairs[0]}, show two fisheye circles side by side"
+    remedy = "stitch them to panoramas of 2:1 with the camera's program, or let it export flat photos, and give those"
+    return f"{found}, whose cameras come out wrong: {remedy}."
 
 
 @contextlib.contextmanager
@@ -145,8 +157,11 @@ def _read_photo(folder: Path, name: str) -> Photo:
         image.load()
         is_turned = orientation in NOT_UPRIGHT
         is_whole_view = is_panorama(image, size)
+        is_pair = not is_whole_view and is_fisheye_pair(image, size)
         largest = largest_value(image, folder / name)
-        return Photo(name, size, camera, has_alpha, is_read, is_turned, is_whole_view, has_focal_length, largest)
+        return Photo(
+            name, size, camera, has_alpha, is_read, is_turned, is_whole_view, is_pair, has_focal_length, largest
+        )
 
 
 def empty_folder(folder: Path) -> Path:

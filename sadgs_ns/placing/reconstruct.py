@@ -9,9 +9,11 @@ import contextlib
 import io
 import itertools
 import json
+import math
+import shutil
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +24,8 @@ import pycolmap
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress
-from sadgs_ns.placing.adjustment import adjust_robustly, refine
+from sadgs_ns.placing.adjustment import adjust_robustly, is_firm, refine, settle
+from sadgs_ns.placing.agreement import most_agreed
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
 from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
@@ -55,6 +58,8 @@ _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose
 _ENOUGH, _MOST_STRETCH = 0.9, 0.1
 """Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
 of lenses and of resized photos differ less, those of models that went wrong more."""
+_SEED_STEP = 1000  # Seeds of one placing lie this far apart, so that those of benchmarks, 0, 1, 2, …, share none
+_DISAGREEMENT = "disagreement.txt"  # File in a model's folder that holds `Measures.disagreement`
 FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
 
 
@@ -93,7 +98,12 @@ def make_model(
         nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
-    return summarize(names, made, database, matching, (model / "attempts.txt").read_text())
+    attempts = (model / "attempts.txt").read_text()
+    disagreement_file = model / _DISAGREEMENT
+    moved = math.nan
+    if disagreement_file.exists():  # A run of an earlier version, which is resumed, has none.
+        moved = float(disagreement_file.read_text())
+    return summarize(names, made, database, matching, attempts, moved)
 
 
 @cache
@@ -166,9 +176,7 @@ def match(
 
     stage = f"matches ({matching})"
     pair_list = database.with_name("pairs.txt")
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    verification.ransac.max_num_trials = _TRIALS
+    verification = verification_options(seed)
     progress(stage, 0, 1)
     if matching == "similar":
         panorama = {view: views[0] for views in rigs for view in views}
@@ -191,6 +199,14 @@ def match(
     progress(stage, len(pairs), len(pairs))
 
 
+def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
+    """Return COLMAP's options for the verification of matches with a seed."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = seed
+    options.ransac.max_num_trials = _TRIALS
+    return options
+
+
 def place_cameras(
     photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None,
     alike: Sequence[Sequence[str]] = (), seed: int = SEED,
@@ -199,10 +215,12 @@ def place_cameras(
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
     new photos, and photos that did not register before are tried again. Cameras of photos that are `alike`, as of
-    `make_model`, are joined if they are one and the model suffices. Raise InputError if no photos could be related.
+    `make_model`, are joined if they are one and the model suffices. A new model that few points hold together is made
+    again with other samples, as of `most_agreed`. Raise InputError if no photos could be related.
     """
     search = _Search.of(photos, names, database, model, base, seed)
-    best = search.attempt("cameras", {})
+    limits: Mapping[str, float] = {}
+    best = search.attempt("cameras", limits)
     attempts = ""
     quality = search.quality(best)
     if not quality.suffices:
@@ -214,6 +232,7 @@ def place_cameras(
         if second_quality > quality:
             best = second
             quality = second_quality
+            limits = _RELAXED
     before = search.before
     if before is None and best is None:
         raise InputError(_unrelated(names, database))
@@ -222,6 +241,10 @@ def place_cameras(
             "none of the photos that were added could be related to the others: take some that share two thirds of "
             "what they show with each other and with those that are there, or take these out of the folder again."
         )
+    moved = math.nan
+    if before is None and not is_firm(best):
+        best, moved = most_agreed(best, lambda number: search.place_again(number, limits), search.rank)
+        quality = search.quality(best)
     joined: dict[int, int] = {}
     if quality.suffices:
         joined = same_cameras(best, alike, search.fixed_cameras)
@@ -236,6 +259,7 @@ def place_cameras(
     best.write(partial)
     check_written(partial, best)
     (partial / "attempts.txt").write_text(attempts)
+    (partial / _DISAGREEMENT).write_text(str(moved))
     if joined:  # Photos that are added later find their folder's camera in the database.
         join_in_database(database, joined)
     partial.rename(model)
@@ -333,10 +357,33 @@ class _Search:
         if self.before is None:
             free_all_parameters(best)
             refine(best, self.database, options)
+            if best.num_points3D() > 0 and not is_firm(best):
+                settle(best, self.database, options, self.fixed_cameras)
         adjust_robustly(best, self.fixed_cameras, self.held_frames)
         if best.num_points3D() == 0:  # None fits with all parameters.
             return None
         return best
+
+    def place_again(self, number: int, limits: Mapping[str, float]) -> pycolmap.Reconstruction | None:
+        """Verify the matches and place the cameras with another seed, and return the best model if there is one.
+
+        The samples of the verification decide more than the mapper's: of lund, mappings of the same verified matches
+        with three of four seeds gave one model.
+        """
+        database = self.database.with_name("again.db")
+        shutil.copyfile(self.database, database)
+        seed = self.seed + number * _SEED_STEP
+        with pycolmap.Database.open(database) as opened:
+            opened.clear_two_view_geometries()
+        pycolmap.geometric_verification(database, two_view_geometry_options=verification_options(seed))
+        model = replace(self, database=database, seed=seed).attempt("cameras (checked)", limits)
+        database.unlink()
+        return model
+
+    def rank(self, model: pycolmap.Reconstruction) -> tuple[bool, int]:
+        """Return whether a model can be right, and how many photos it registered."""
+        quality = self.quality(model)
+        return quality.is_possible, quality.registered
 
     def quality(self, candidate: pycolmap.Reconstruction | None) -> _Quality:
         """Tell whether a model can be right, whether it suffices, and how many photos it registered."""
@@ -381,9 +428,17 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 
 
 def summarize(
-    names: Sequence[str], model: pycolmap.Reconstruction, database: Path, matching: Matching, attempts: str
+    names: Sequence[str],
+    model: pycolmap.Reconstruction,
+    database: Path,
+    matching: Matching,
+    attempts: str,
+    moved: float = math.nan,
 ) -> Summary:
-    """Count the registered photos, find out why the others are none, and judge the model."""
+    """Count the registered photos, find out why the others are none, and judge the model.
+
+    `moved` is the disagreement with another placing, as of `Measures`.
+    """
     registered = registered_photos(model)
     left_out = {}
     with pycolmap.Database.open(database) as opened:
@@ -406,7 +461,7 @@ def summarize(
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()
-    judgement = judge(measure(model))
+    judgement = judge(replace(measure(model), disagreement=moved))
     return Summary(
         len(names), len(registered), model.num_points3D(), error, left_out, matching, attempts, judgement.doubts,
         judgement.faults,

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sadgs_ns import gsplat_compat
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import TILE_SIZE, compositing
 from sadgs_ns.kernels import projection as kernels_projection
@@ -26,13 +25,9 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
     check_gaussians(len(viewmats), len(gaussians.means))
     if begin_tiles:
         check_pixels(len(viewmats), height, width)
-    differentiates_cameras = viewmats.requires_grad  # as for learned poses; our kernels do not
-    if differentiates_cameras:
-        radii, means2d, depths, conics = gsplat_compat.project(*gaussians[:4], *cameras, options.near_plane)
-    else:
-        # Colours take these centres, so that their gradient is added in the projection's backward kernel.
-        radii, means2d, depths, conics, means = kernels_projection.project(*gaussians[:4], *cameras, options.near_plane)
-        gaussians = gaussians._replace(means=means)
+    # Colours take these centres, so that their gradient is added in the projection's backward kernel.
+    radii, means2d, depths, conics, means = kernels_projection.project(*gaussians[:4], *cameras, options.near_plane)
+    gaussians = gaussians._replace(means=means)
     radii = radii.contiguous()  # Culling, and tile lists that are too short, set these very radii to 0.
     opacities = opacities_in_views(gaussians.opacities, len(viewmats))
     tiles = None
@@ -44,7 +39,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
         radii = cull_off_axis(radii, means2d, width, height, options.max_off_axis)
     degree = options.sh_degree
     colors = gaussians.colors
-    if isinstance(colors, tuple) and degree is not None and degree <= MAX_DEGREE and not differentiates_cameras:
+    if isinstance(colors, tuple) and degree is not None and degree <= MAX_DEGREE:
         colors = colors_from_harmonics(degree, gaussians.means, *colors, viewmats, radii)
     else:
         colors = _colors_in_views(gaussians, viewmats, degree)

@@ -36,7 +36,7 @@ from sadgs_ns.training.options import check_ranges, fill_missing, hide
 from sadgs_ns.training.run import processes
 from sadgs_ns.training.run.progress import ProgressTable
 from sadgs_ns.training.run.run_folder import begin
-from sadgs_ns.training.step.optimizers import FusedAdam, RunLengthDecaySchedulerConfig
+from sadgs_ns.training.step.optimizers import FusedAdam, RunLengthDecaySchedulerConfig, pose_optimizer
 
 _MOST_RANDOM = 10_000_000  # Most random points to start from: they take the host's memory before the cap thins them out
 _WIDEST_BLUR = 100  # Largest window of `energy_blur`, which makes kernels of thousands of pixels
@@ -47,13 +47,12 @@ def _class(module: str, name: str) -> type:
     return getattr(import_module(f"sadgs_ns.training.{module}"), name)
 
 
-@hide("trans_l2_penalty", "rot_l2_penalty")
 @dataclass
 class PoseOptimizerConfig(CameraOptimizerConfig):
-    """nerfstudio's options of learned camera poses."""
+    """nerfstudio's options of learned poses in a `config.yml` of earlier versions; `poses` takes their place."""
 
     mode: Literal["off", "SO3xR3", "SE3"] = "off"
-    """Whether and how the cameras' poses are refined; SO3xR3 turns and moves each camera."""
+    """Whether and how the cameras' poses were refined."""
 
 
 @dataclass
@@ -63,8 +62,9 @@ class SadgsModelConfig(InstantiateConfig):
     _target: type = field(default_factory=lambda: _class("model", "SadgsModel"))
     strategy: StructureAwareStrategy = field(default_factory=StructureAwareStrategy)
     """When and how Gaussians are split, cloned and pruned."""
-    camera_optimizer: PoseOptimizerConfig = field(default_factory=PoseOptimizerConfig)
-    """Whether and how the cameras' poses are refined in training."""
+    poses: Literal["fixed", "refined"] = "fixed"
+    """Whether the poses of the training cameras are refined together with the Gaussians, on one device.
+    The motion that all have in common is taken out, so held-out cameras stay where they are."""
     backend: BackendName = "auto"
     """Which code draws: auto takes Triton kernels where they work, gsplat on other CUDA devices, and torch elsewhere.
     gsplat trains on one GPU, without CUDA graphs, and alone needs nvcc."""
@@ -95,12 +95,13 @@ class SadgsModelConfig(InstantiateConfig):
     averaged_share: float = 0.05
     """Share of the run, at its end, over which the Gaussians' parameters are averaged, in [0, 0.3].
     The finished run has the mean; with 0 it has the parameters of the last iteration."""
-    max_off_axis: float = 4.0
+    max_off_axis: float = 0.0
     """Gaussians whose centre is projected farther than this from the image's centre, in half images, are not drawn.
-    Far off the axis a Gaussian's image is wrong, and can be haze over the view; 0 draws all."""
-    near_plane: float | None = None
+    0 draws all, as other programs draw the exported file."""
+    near_plane: Literal["viewers", "scene"] | float = "viewers"
     """Depth from which Gaussians are drawn, in training and later, in the run's units.
-    None is half the depth of a training camera's fifth nearest SfM point, for the camera where this is least."""
+    "viewers" is 0.01, from which other programs draw the exported file. "scene" is half the depth of a training
+    camera's fifth nearest SfM point, for the camera where this is least; "viewers" is never more than that."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one that lies beside a view can cover it with haze; 0 sets no limit."""
@@ -115,6 +116,9 @@ class SadgsModelConfig(InstantiateConfig):
     def check(self) -> None:
         """Raise InputError if an option is out of its range."""
         near = self.near_plane
+        is_near_plane = near in ("viewers", "scene", None)  # Runs of before have None for "scene".
+        if not is_near_plane:
+            is_near_plane = not isinstance(near, str) and 0 < near < math.inf
         stereo = self.stereo_points
         off_axis = self.max_off_axis
         angle = self.max_angular_scale
@@ -127,7 +131,7 @@ class SadgsModelConfig(InstantiateConfig):
             ("max_off_axis", 0 <= off_axis < math.inf, "finite and not negative"),
             ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
             ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
-            ("near_plane", near is None or 0 < near < math.inf, "positive and finite"),
+            ("near_plane", is_near_plane, "viewers, scene, or positive and finite"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
             ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
             ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
@@ -329,6 +333,7 @@ class SadgsTrainerConfig(TrainerConfig):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the values of a `config.yml` or a copy; options that an earlier version did not have get defaults."""
         vars(self).update(state)
+        _replace_camera_optimizer(self)
         fill_missing(self)
 
     def print_to_terminal(self) -> None:
@@ -375,7 +380,6 @@ class SadgsTrainerConfig(TrainerConfig):
             return
         options_of_one_device = [
             ("pipeline.model.color_model", model.color_model != "none", "set it to none"),
-            ("pipeline.model.camera_optimizer.mode", model.camera_optimizer.mode != "off", "set it to off"),
             ("start_paused", self.start_paused, "leave it off, since the viewer is off, too"),
             (f"{SWITCH}=0", switched_off() and device == "cuda", "unset it"),
         ]
@@ -390,7 +394,7 @@ class SadgsTrainerConfig(TrainerConfig):
             rate = adam.lr
             scheduler = configs.get("scheduler")
             ranges = [  # One launch updates all parameters.
-                ("_target", adam._target is FusedAdam, "sadgs's Adam"),
+                ("_target", issubclass(adam._target, FusedAdam), "sadgs's Adam"),
                 ("max_norm", adam.max_norm is None, "left out"),
                 ("weight_decay", not adam.weight_decay, "left out"),
                 ("lr", 0 <= rate <= 1, "in [0, 1]"),
@@ -406,6 +410,18 @@ class SadgsTrainerConfig(TrainerConfig):
         """Write `config.yml` if the run can begin; raises InputError as `check`, and as `run_folder.begin`."""
         self.check()
         begin(self)
+
+
+def _replace_camera_optimizer(config: SadgsTrainerConfig) -> None:
+    """Put `poses` in the place of nerfstudio's camera optimizer, which a `config.yml` of earlier versions has."""
+    model = vars(config.pipeline).get("model")
+    if model is not None:
+        optimizer = vars(model).pop("camera_optimizer", None)
+        if optimizer is not None and optimizer.mode != "off":
+            model.poses = "refined"
+    if "poses" not in config.optimizers:
+        config.optimizers.pop("camera_opt", None)
+        config.optimizers["poses"] = pose_optimizer()
 
 
 def _problem_of_config_file(path: Path) -> str:

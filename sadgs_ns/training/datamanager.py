@@ -17,6 +17,7 @@ from nerfstudio.data.datasets.base_dataset import InputDataset
 from rich.progress import track
 
 from sadgs_ns.data import colmap
+from sadgs_ns.data.cameras import mark_training_views
 from sadgs_ns.data.checks import splits
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
@@ -43,7 +44,7 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         for dataset in (self.train_dataset, self.eval_dataset):
             _make_paths(dataset)
             splits.check_paths(dataset.image_filenames)
-            dataset.cameras.metadata = dataset.cameras.metadata or {}  # `ns-export cameras` needs one.
+            mark_training_views(dataset.cameras, dataset.image_filenames, self.train_dataset.image_filenames)
             _check_sizes(dataset)
             if type(self).setup_train.__module__ == "nerfstudio.scripts.render":  # `ns-render dataset` replaces it.
                 _check_stems(dataset.image_filenames)

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
@@ -18,7 +19,7 @@ from pytorch_msssim import SSIM
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns.data.cameras import camera_positions, check_camera_types
+from sadgs_ns.data.cameras import camera_positions, check_camera_types, training_view
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
@@ -38,11 +39,12 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.exposure_table import ExposureTable
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
-from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
+from sadgs_ns.training.outputs import LazyOutputs, in_viewer, rgba_image, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.color_matrices import anchored
 from sadgs_ns.training.step.parameter_average import RunningMean
+from sadgs_ns.training.step.poses import RefinedPoses, fit_poses
 
 CAMERA_CLEARANCE = 2.0
 """Initial Gaussians within this many of their standard deviations of a camera are dropped, unlike in the paper. That
@@ -60,6 +62,7 @@ class SadgsModel(SplatfactoModel):
     plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
     gain_matrices: Tensor | None
+    get_rgba_image = staticmethod(rgba_image)
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
@@ -71,7 +74,11 @@ class SadgsModel(SplatfactoModel):
         # Which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]
         self.synthetic = synthetic
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
-        self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
+        # nerfstudio's programs ask for one; it does nothing.
+        self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=self.num_train_data, device="cpu")
+        self.poses: RefinedPoses | None = None
+        if config.poses == "refined":
+            self.poses = RefinedPoses(self.num_train_data)
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self._lpips: list[torch.nn.Module | None] = []  # A list keeps its weights out of the checkpoint.
         self.step = 0
@@ -92,6 +99,13 @@ class SadgsModel(SplatfactoModel):
 
     def set_cameras(self, cameras: Cameras) -> None:
         """Set the extent and drop Gaussians that are too close to a camera; call before optimizers are made."""
+        if self.poses is not None:
+            points = self.means.detach()
+            if self.seed_points is not None:
+                points = self.seed_points[0].to(points)
+            viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
+            sizes = torch.cat([cameras.width, cameras.height], dim=-1)
+            self.poses.set_cameras(viewmats, cameras.get_intrinsics_matrices(), sizes, points)
         positions = camera_positions(cameras)
         self.strategy_state["scene_scale"] = camera_extent(positions)
         self.camera_positions = positions.to(self.means)
@@ -126,7 +140,7 @@ class SadgsModel(SplatfactoModel):
     def clear_paths(self, viewmats: Tensor, near_plane: float) -> None:
         """Let densification prune haze near the paths of the training cameras [C, 4, 4], if the options ask for it.
 
-        `near_plane` is the depth from which Gaussians will be drawn.
+        `near_plane` is the scene's (`scene_near_plane`), which need not be the run's.
         """
         if not self.config.clear_paths:
             return
@@ -137,7 +151,11 @@ class SadgsModel(SplatfactoModel):
         self.strategy_state["camera_paths"] = CameraPaths.of(viewmats, near_plane, surfaces)
 
     def shard(self, world: World) -> None:
-        """Keep this process's part of the Gaussians only, or raise InputError if the backend needs all."""
+        """Keep this process's part of the Gaussians only, and all poses as they are.
+
+        Raises InputError if the backend needs all Gaussians.
+        """
+        self.poses = None
         choose_backend(self.config.backend, world.device, world.is_single)
         part = world.take_even_part(self.num_points)
         for parameter in self.gauss_params.values():
@@ -195,17 +213,17 @@ class SadgsModel(SplatfactoModel):
 
     @property
     def trained_params(self) -> dict[str, Tensor]:
-        """Parameters by name that a training step reads: the Gaussians', and colour matrices if there are some."""
+        """Parameters by name that a training step reads: the Gaussians', and perhaps colour matrices and poses."""
         params: dict[str, Tensor] = dict(self.gauss_params.items())
         if self.color_matrices is not None:
             params["color_matrices"] = self.color_matrices
+        if self.poses is not None:
+            params["poses"] = self.poses.table
         return params
 
     def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """Return what is optimized, by the names of the optimizers."""
-        groups = {name: [parameter] for name, parameter in self.trained_params.items()}
-        self.camera_optimizer.get_param_groups(param_groups=groups)  # type: ignore[arg-type]
-        return groups  # type: ignore[return-value]
+        return {name: [parameter] for name, parameter in self.trained_params.items()}  # type: ignore[misc]
 
     @property
     def may_use_gains(self) -> bool:
@@ -247,8 +265,8 @@ class SadgsModel(SplatfactoModel):
         return self.color_matrices is not None or self.gain_matrices is not None
 
     def view_ids(self, cam_indices: Sequence[int]) -> Tensor | None:
-        """Return indices of C views on the device, int64 [C], without waiting; None without colour matrices."""
-        if not self.has_view_colors:
+        """Return indices of C views on the device, int64 [C], without waiting; None if a step needs none."""
+        if not self.has_view_colors and self.poses is None:
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
 
@@ -380,15 +398,14 @@ class SadgsModel(SplatfactoModel):
         }
 
     def pinhole(self, camera: Cameras) -> Pinholes:
-        """Return nerfstudio's camera, shape [1], as the rasterizer takes it; raise InputError if it has no pixel."""
+        """Return nerfstudio's camera, shape [1], as the rasterizer takes it, that of a training view as refined."""
         # Poses of a camera path may be whole numbers.
         viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds.float()).to(self.device)
+        view = training_view(camera)
+        if self.poses is not None and view is not None:
+            viewmats = self.poses.viewmat(view)[None]
         Ks = camera.get_intrinsics_matrices().to(self.device)
-        width = int(camera.width.item())
-        height = int(camera.height.item())
-        if width < 1 or height < 1:
-            raise InputError(f"A picture of {width} × {height} px was asked for: give the camera path a larger size.")
-        return Pinholes(viewmats, Ks, width, height)
+        return Pinholes(viewmats, Ks, int(camera.width.item()), int(camera.height.item()))
 
     @torch.no_grad()
     def get_normals(self, camera: Cameras, params: Mapping[str, Tensor] | None = None) -> Tensor:
@@ -426,13 +443,6 @@ class SadgsModel(SplatfactoModel):
             return outputs
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
-
-    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
-        alpha = outputs["accumulation"]
-        seen = outputs[output_name] - (1 - alpha) * outputs["background"]
-        color = torch.where(alpha > 0, seen / alpha, 0.0)
-        return torch.cat([color.clamp(0.0, 1.0), alpha], dim=-1)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""
@@ -564,9 +574,14 @@ class SadgsModel(SplatfactoModel):
         return moved
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
-        """Load a checkpoint of any number of Gaussians, into the parameters that optimizers may hold."""
+        """Load a checkpoint of any number of Gaussians, into the parameters that optimizers may hold.
+
+        Raises InputError if it has the poses of other views.
+        """
+        dict = {**dict}
         if self.color_matrices is None:
-            dict = {name: value for name, value in dict.items() if name != "color_matrices"}
+            dict.pop("color_matrices", None)
+        fit_poses(dict, self.poses)
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)

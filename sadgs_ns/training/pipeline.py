@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
@@ -30,6 +31,7 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import NORMALS, SadgsModel
+from sadgs_ns.training.run.checkpoints import check_number_of_views
 from sadgs_ns.training.run.memory_plan import choose_image_storage
 from sadgs_ns.training.run.point_observations import PointObservations
 from sadgs_ns.training.run.progress import note, warn
@@ -71,6 +73,9 @@ class SadgsPipeline(VanillaPipeline):
         self._warn_of_other_background()
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
+        if self.model.poses is not None and isinstance(self.datamanager.config.dataparser, BlenderDataParserConfig):
+            note("The poses stay as they are: those of Blender data are exact.")
+            self.model.poses = None
         self.model.set_cameras(self.datamanager.train_dataset.cameras)
         self.views = TrainingViews(self.datamanager, self.model)
         self.structure_cache = StructureCache(
@@ -118,7 +123,7 @@ class SadgsPipeline(VanillaPipeline):
     def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
         """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
 
-        It loads the images' cameras, so call it after `decide_near_plane`. Raises as `PointObservations`.
+        It loads the images' cameras, so call it after `near_plane_of_scene`. Raises as `PointObservations`.
         """
         if self.model.seed_points is None:
             return None
@@ -299,7 +304,8 @@ class SadgsPipeline(VanillaPipeline):
             quantized = None
             if model.strategy.observes(step):
                 quantized = stack(self.structure_cache.get(views, model.world))
-            cameras = Pinholes(*self.views.stacked_cameras(indices), width, height)
+            # A step itself moves them as the poses are refined.
+            cameras = Pinholes(*self.views.stacked_cameras(indices, refined=False), width, height)
             options = model.step_options(cameras, indices)
             result.append(ViewGroup(indices, cameras, options, data, model.view_ids(indices), quantized))
         return result
@@ -344,9 +350,8 @@ class SadgsPipeline(VanillaPipeline):
             raise InputError("The checkpoint lacks the state of structure-aware densification, so splatfacto made it.")
         for name, parameter in self.named_parameters():
             value = loaded.get(name)
-            if ".gauss_params." not in name and value is not None and value.shape != parameter.shape:
-                problem = f"The checkpoint's {name} is for {len(value)} training views, and there are {len(parameter)}"
-                raise InputError(f"{problem}: set the parser's options that choose them as they were.")
+            if ".gauss_params." not in name and value is not None:
+                check_number_of_views(name, value, parameter)
         super().load_pipeline(loaded_state, step)
 
     def get_extra_state(self) -> dict[str, Any]:

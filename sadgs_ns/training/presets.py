@@ -9,7 +9,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
-from sadgs_ns.training.step.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig
+from sadgs_ns.training.step.optimizers import FusedAdamOptimizerConfig, RunLengthDecaySchedulerConfig, pose_optimizer
 
 RATES: dict[str, tuple[float, float, float]] = {
     "means": (1.6e-4, 1.0, 0.01),
@@ -18,7 +18,6 @@ RATES: dict[str, tuple[float, float, float]] = {
     "opacities": (0.025, 1.0, 0.1),
     "scales": (0.02, 1.0, 1.0),
     "quats": (0.002, 1.0, 1.0),
-    "camera_opt": (1e-4, 1.0, 0.005),
     "color_matrices": (3e-3, 1.0, 0.1),
 }
 """Learning rate of each group of parameters, and factors on it at the first and last iteration, for steps of one view.
@@ -41,6 +40,7 @@ def optimizers(**rates: tuple[float, float, float]) -> dict[str, dict[str, Any]]
             groups[name]["scheduler"] = RunLengthDecaySchedulerConfig(
                 initial_factor=initial_factor, final_factor=final_factor, hold_share=hold
             )
+    groups["poses"] = pose_optimizer()
     return groups
 
 
@@ -54,7 +54,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             ssim_lambda=0.2,
             opacity_reg=0.0,
             averaged_share=0.0,
-            max_off_axis=0.0,
+            near_plane="scene",
             max_angular_scale=0.0,
             stereo_points=0,
             exposure="off",

@@ -14,9 +14,10 @@ import pytest
 import yaml
 
 from benchmarks import camera_measures, camera_run, camera_table, camera_truth, cameras, results, side_by_side
-from benchmarks.camera_measures import Observed, align, common_points, displacement, leave_out, reprojection_errors
+from benchmarks.camera_measures import leave_out, reprojection_errors
 from helpers.drawn_photos import VIEWS, draw_photos
 from sadgs_ns.placing import reconstruct
+from sadgs_ns.placing.agreement import Observed, align, common_points, displacement
 
 SIMILARITY = pycolmap.Sim3d(2.5, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.5])), np.array([4.0, -1.0, 2.0]))
 CONFIG = Path(cameras.__file__).parents[1] / "configs/bench/placing.yaml"

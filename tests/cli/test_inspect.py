@@ -180,13 +180,13 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     line = wrong([str(tmp_path / "run")], capsys)
     assert f"{latest} is not of this version of sadgs (" in line and line.endswith(remedy)
     state["pipeline"]["_extra_state"] = extra
-    state["pipeline"] |= {"_model.camera_optimizer.pose_adjustment": torch.zeros(1, 6)}
+    state["pipeline"] |= {"_model.poses.table": torch.zeros(1, 6)}
     torch.save(state, latest)
     config = yaml.load(run.read_text(), Loader=yaml.Loader)
-    config.pipeline.model.camera_optimizer.mode = "SO3xR3"
+    config.pipeline.model.poses = "refined"
     (tmp_path / "run" / "config.yml").write_text(yaml.dump(config))
     line = wrong([str(tmp_path / "run")], capsys)
-    assert f"{latest} does not fit its run: The checkpoint's _model.camera_optimizer" in line and line.endswith(remedy)
+    assert f"{latest} does not fit its run: The checkpoint's _model.poses.table" in line and line.endswith(remedy)
     (folder / "step-000000008.ckpt").write_bytes(b"half")
     line = wrong([str(tmp_path / "run"), "--load-step", "8"], capsys)
     assert "step-000000008.ckpt is cut off, damaged" in line and line.endswith(remedy)

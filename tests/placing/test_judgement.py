@@ -100,6 +100,12 @@ def test_nothing_speaks_against_cameras_around_an_object():
         ("stretch", 1.5, 175.8, r"their focal lengths across and down would differ by a factor of 175\.8: take a step"),
         ("observations", 30, 6, r"half of the photos show at most 6 points: take sharp photos"),
         ("parallax", 2.2, 1.6, r"half of the points are seen from directions within 1\.6° of each other: take a step"),
+        (
+            "disagreement",
+            0.03,
+            0.13,
+            r"with other random samples they move by 13 % of a photo's size: take",
+        ),
         ("shift", 0.003, 0.001, r"as if the camera had turned on the spot, to 0\.10 % of their size: take a step"),
     ],
 )

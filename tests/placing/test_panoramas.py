@@ -9,14 +9,15 @@ from collections import defaultdict
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
 
 from helpers.drawn_photos import draw_panorama, draw_photo, draw_photos, panorama_centres
-from sadgs_ns.cli.process import Process, process
-from sadgs_ns.placing.panoramas import VIEWS, cut, is_panorama, rotations
+from sadgs_ns.cli.process import Process, main, process
+from sadgs_ns.placing.panoramas import VIEWS, cut, is_fisheye_pair, is_panorama, rotations
 from sadgs_ns.placing.photos import read_photos
 from sadgs_ns.placing.reconstruct import choose_pairs
 
@@ -133,6 +134,71 @@ def test_what_is_a_panorama(panoramas: list[Image.Image], tmp_path: Path):
         assert read_photos(tmp_path, [f"{i}.jpg"], lambda *step: None)[0].is_panorama
     told, part = read_photos(tmp_path, ["told.jpg", "wide.jpg"], lambda *step: None)
     assert told.is_panorama and not part.is_panorama
+
+
+def fisheye_pair(panorama: Image.Image, radius: float = 0.97, glare: int = 0) -> Image.Image:
+    """The two circles of 200° of a 360° camera, of which a panorama was made, with a radius in halves of the height."""
+    side = panorama.height
+    across = (np.arange(side) + 0.5) / side * 2 - 1
+    x, y = np.meshgrid(across, across)
+    distance = np.hypot(x, y)
+    angle = np.radians(100) * distance / radius
+    ahead = np.cos(angle)
+    right = np.sin(angle) * x / distance
+    down = np.sin(angle) * y / distance
+    row = (0.5 + np.arcsin(np.clip(down, -1, 1)) / np.pi) * side - 0.5
+    circles = []
+    for sign in (1, -1):
+        column = (1 + np.arctan2(sign * right, sign * ahead) / np.pi) * side - 0.5
+        places = (column.astype(np.float32), row.astype(np.float32))
+        circle = cv2.remap(np.asarray(panorama), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        circle[distance > radius] = glare
+        circles.append(circle)
+    return Image.fromarray(np.concatenate(circles, axis=1))
+
+
+@pytest.mark.parametrize(("radius", "glare"), [(0.97, 0), (1.1, 0), (0.92, 25)])
+def test_pairs_of_fisheye_circles_are_told(panoramas: list[Image.Image], radius: float, glare: int):
+    for panorama in panoramas:
+        pair = fisheye_pair(panorama, radius, glare)
+        assert is_fisheye_pair(pair, pair.size) and not is_panorama(pair, pair.size)
+
+
+def test_other_wide_photos_are_no_pairs_of_fisheye_circles(panoramas: list[Image.Image]):
+    photo = next(draw_photos()).resize((512, 384))
+    wide = photo.crop((0, 64, 512, 320))
+    small = Image.new("RGB", (512, 256))  # A thing before a black background
+    small.paste(photo.resize((256, 192)), (128, 32))
+    rows = np.linspace(-1, 1, 256)[:, None, None]
+    night = Image.fromarray(np.uint8(np.asarray(panoramas[0]) * (np.abs(rows) < 0.35)))  # Sky and floor are dark.
+    pair = fisheye_pair(panoramas[0])
+    for image in (*panoramas, photo, wide, small, night, Image.new("RGB", (512, 256)), pair.resize((512, 384))):
+        assert not is_fisheye_pair(image, image.size)
+
+
+@pytest.mark.hard_case(
+    "pairs of fisheye circles, as a 360° camera stores them", "refused before any work, with the remedy: stitch them"
+)
+def test_pairs_of_fisheye_circles_are_refused(panoramas: list[Image.Image], tmp_path: Path, capsys):
+    source = tmp_path / "photos"
+    source.mkdir()
+    for i, panorama in enumerate(panoramas[:4]):
+        fisheye_pair(panorama).resize((1024, 512)).save(source / f"{i}.jpg", quality=80)
+    next(draw_photos()).save(source / "phone.jpg")
+    out = tmp_path / "scene"
+    assert main([str(source), str(out)]) == 2
+    problem = f"4 of the 5 photos in {source}, such as 0.jpg, show two fisheye circles side by side"
+    printed = capsys.readouterr().err
+    assert problem in printed and "stitch them to panoramas of 2:1 with the camera's program" in printed
+    assert not out.exists()
+
+
+def test_a_few_pairs_of_circles_among_other_photos_are_left_to_colmap(panoramas: list[Image.Image], tmp_path: Path):
+    fisheye_pair(panoramas[0]).save(tmp_path / "0.png")
+    for i, photo in enumerate(itertools.islice(draw_photos(), 2), 1):
+        photo.save(tmp_path / f"{i}.png")
+    photos = read_photos(tmp_path, ["0.png", "1.png", "2.png"], lambda *step: None)
+    assert [photo.is_fisheye_pair for photo in photos] == [True, False, False]
 
 
 def test_views_are_paired_with_those_of_other_panoramas():

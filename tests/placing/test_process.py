@@ -150,7 +150,9 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_an_interrupted_run_ends_in_a_sentence_and_goes_on(run: Run):
     assert run.exit_code == 143 and run.printed == "sadgs-process: stopped; run the same command again to resume.\n"
     assert run.left - {"database.db-shm", "database.db-wal"} == {"settings.json", "database.db", "alpha"}
-    assert run.stages == ["photos", "features", "matches (exhaustive)", "cameras", "undistorted photos"]
+    # Few points of such small photos hold them together, so they are placed a second time.
+    placing = ["cameras", "cameras (checked)"]
+    assert run.stages == ["photos", "features", "matches (exhaustive)", *placing, "undistorted photos"]
     assert run.matches[0] == run.matches[1] > 0
 
 
@@ -233,6 +235,7 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", note_the_angle)
     monkeypatch.setattr(reconstruct, "adjust_robustly", spoil_the_first)
+    monkeypatch.setattr(reconstruct, "is_firm", lambda model: True)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
@@ -263,6 +266,7 @@ def test_a_wrong_model_ranks_below_one_with_fewer_photos(
                 model.deregister_frame(frame)
 
     monkeypatch.setattr(reconstruct, "adjust_robustly", spoil)
+    monkeypatch.setattr(reconstruct, "is_firm", lambda model: True)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     made = pycolmap.Reconstruction(tmp_path / "model")

@@ -143,7 +143,7 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
     assert method.config.method_name == name
     assert method.description.startswith("Structure-aware densification")
     groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10)).gauss_params)
-    assert set(method.config.optimizers) == groups | {"camera_opt", "color_matrices"}
+    assert set(method.config.optimizers) == groups | {"poses", "color_matrices"}
 
 
 def test_presets_differ_where_their_comments_say():
@@ -197,7 +197,7 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     expected = """
         data output-dir experiment-name vis viewer.websocket-port viewer.websocket-host max-num-iterations
         steps-per-save load-dir load-checkpoint load-config machine.seed machine.device-type machine.num-devices
-        pipeline.model.camera-optimizer.mode pipeline.model.color-model pipeline.model.backend
+        pipeline.model.poses pipeline.model.color-model pipeline.model.backend
         pipeline.model.background-color pipeline.model.sh-degree pipeline.model.random-init pipeline.model.num-random
     """
     assert {f"--{name}" for name in expected.split()} <= set(options)
@@ -355,7 +355,8 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model = config.pipeline.model
     assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
     model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
-    model.averaged_share = model.max_off_axis = model.max_angular_scale = 0.0
+    model.averaged_share = model.max_angular_scale = 0.0
+    model.near_plane = "scene"
     model.stereo_points, model.clear_paths, model.exposure = 0, False, "off"
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200

@@ -16,6 +16,7 @@ from sadgs_ns.training.kernels_ahead import compile_ahead
 from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.progress import note, warn
+from sadgs_ns.training.step.optimizers import RowAdam
 
 _PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting for
 
@@ -27,7 +28,7 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
     alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
     for name, optimizer in optimizers.items():
         value = model.trained_params.get(name)
-        if value is not None and value.numel():
+        if value is not None and value.numel() and not isinstance(optimizer, RowAdam):
             key = name in model.gauss_params, optimizer.defaults["betas"], optimizer.defaults["eps"]
             alike.setdefault(key, []).append(tuple(value.shape[1:]))
     return KernelChoice(
@@ -37,6 +38,7 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
         is_black=model.config.background_color == "black",
         has_color_matrices=model.has_view_colors,
         learns_color_matrices=model.color_matrices is not None,
+        moves_cameras=model.poses is not None,
         single_process=model.world.is_single,
         size=(int(sizes.width.max()), int(sizes.height.max())),
         # The run's own near plane may lie behind these Gaussians, which would launch no compositing.

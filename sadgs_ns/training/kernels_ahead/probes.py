@@ -20,11 +20,13 @@ from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
+from sadgs_ns.training.step.poses import corrected_views
+from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
 
 # Number of Gaussians, and width and height in px, with which the kernels are tried
 _GAUSSIANS = 64
 _SIZE = 64
-_DRAWING = RenderOptions(max_off_axis=4.0, backend="triton")
+_DRAWING = RenderOptions(backend="triton")
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,7 @@ class KernelChoice:
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
     learns_color_matrices: bool = False
+    moves_cameras: bool = False  # Whether the cameras' poses have gradients
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
     drawing: RenderOptions = _DRAWING  # With the backend that draws, and a near plane before Gaussians that are tried
@@ -78,6 +81,8 @@ class Stages:
         }
         if self.choice.has_color_matrices:
             stages["colour matrices"] = self.colors
+        if self.choice.moves_cameras:
+            stages["poses"] = self.poses
         return stages
 
     def after_projection(self) -> dict[str, Callable[[], None]]:
@@ -120,6 +125,16 @@ class Stages:
         matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1)
         matrices.requires_grad_(self.choice.learns_color_matrices)
         correct_colors(renders, alphas, matrices).sum().backward()
+
+    def poses(self) -> None:
+        table = torch.zeros((self.views, 6), device=self.device, requires_grad=True)
+        view_ids = torch.arange(self.views, device=self.device)
+        corrected_views(self.cameras.viewmats, table, view_ids).sum().backward()
+        moved = RowUpdate(torch.zeros(self.views, dtype=torch.bool, device=self.device), torch.zeros_like(table))
+        rate = torch.zeros(1, device=self.device)[0]
+        state = empty_moments(table.detach())
+        flag = torch.zeros(1, device=self.device)
+        move_rows(table.detach(), torch.zeros_like(table), state, moved, rate, (0.9, 0.999), 1e-15, flag)
 
     def update(self) -> None:
         from sadgs_ns.kernels.adam import adam_step
@@ -165,13 +180,15 @@ class Stages:
         from sadgs_ns.kernels.projection import project
 
         means, quats, scales = (value.clone().requires_grad_() for value in self.gaussians[:3])
-        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *self.cameras)
+        viewmats = self.cameras.viewmats.clone().requires_grad_(self.choice.moves_cameras)
+        cameras = self.cameras._replace(viewmats=viewmats)
+        radii, means2d, _, conics, centres = project(means, quats, scales, self.opacities, *cameras)
         results = [means2d, conics]
         degree = self.choice.sh_degree
         if degree > 0:
             num_rest = (degree + 1) ** 2 - 1
             rest = self.means.new_zeros((_GAUSSIANS, num_rest, 3))
-            results.append(colors_from_harmonics(degree, centres, self.means, rest, self.cameras.viewmats, radii))
+            results.append(colors_from_harmonics(degree, centres, self.means, rest, viewmats, radii))
         torch.autograd.backward([value.sum() for value in results])
 
     def observation(self) -> None:

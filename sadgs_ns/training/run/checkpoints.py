@@ -107,6 +107,13 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
     raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
 
 
+def check_number_of_views(name: str, value: Tensor, expected: Tensor) -> None:
+    """Raise InputError if a checkpoint's tensor is for another number of training views than there are."""
+    if value.shape != expected.shape:
+        problem = f"The checkpoint's {name} is for {len(value)} training views, and there are {len(expected)}"
+        raise InputError(f"{problem}: set the parser's options that choose them as they were.")
+
+
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:
     """Return a checkpoint after `change` was applied to its tensors [N, …] of Gaussians, in a fixed order."""
     pipeline = dict(state["pipeline"])

@@ -10,6 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from sadgs_ns.geometry.near_plane import scene_near_plane
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
@@ -28,16 +29,29 @@ LEAST_PIXELS = 1.5e6
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
-def decide_near_plane(pipeline: SadgsPipeline, before: RunPlan | None) -> float:
-    """Return the depth from which Gaussians are drawn: the option's, the one of the plan `before`, or the scene's.
+def decide_near_plane(option: str | float | None, of_scene: float, before: RunPlan | None) -> float:
+    """Return the depth from which Gaussians are drawn.
+
+    Args:
+        option: The model's option; in runs of before None stood for "scene".
+        of_scene: What `near_plane_of_scene` returned.
+        before: Plan of the checkpoint's run. Its depth is kept unless the option is a number.
+    """
+    if option is not None and not isinstance(option, str):
+        return option
+    if before is not None:
+        return before.near_plane
+    if option == "viewers":
+        return min(NEAR_PLANE, of_scene)
+    return of_scene
+
+
+def near_plane_of_scene(pipeline: SadgsPipeline) -> float:
+    """Return how near anything comes to the training cameras, by `scene_near_plane`.
 
     Call this before images are undistorted, which changes the cameras' intrinsics and sizes.
     """
     model = pipeline.model
-    if model.config.near_plane is not None:
-        return model.config.near_plane
-    if before is not None:
-        return before.near_plane
     points = model.means.new_zeros((0, 3))
     if model.seed_points is not None:
         points = model.seed_points[0].to(model.means)

@@ -10,7 +10,13 @@ from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import processes
 from sadgs_ns.training.run.exposure_start import resume_with_gains, start_with_gains
-from sadgs_ns.training.run.planning import decide_near_plane, one_device_is_quicker, plan_length, plan_run
+from sadgs_ns.training.run.planning import (
+    decide_near_plane,
+    near_plane_of_scene,
+    one_device_is_quicker,
+    plan_length,
+    plan_run,
+)
 from sadgs_ns.training.run.processes import Peers
 from sadgs_ns.training.run.progress import note
 from sadgs_ns.training.run.resume import Resumption
@@ -41,16 +47,19 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     before = None
     if resumed is not None:
         before = resumed.plan
-    near_plane = decide_near_plane(pipeline, before)
+    of_scene = near_plane_of_scene(pipeline)
+    near_plane = decide_near_plane(pipeline.model.config.near_plane, of_scene, before)
     if resumed is None:
         start_with_gains(pipeline, world)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
     if resumed is None:
-        pipeline.clear_paths(near_plane)
+        pipeline.clear_paths(of_scene)
     length = plan_length(config, len(pipeline.views), before)
     world, peers = choose_processes(config, pipeline, length, world, peers)
     if not world.is_single:
         turn_viewer_off(config)
+        if pipeline.model.poses is not None:
+            note("The poses stay as they are: they are refined on one device only.")
         pipeline.model.shard(world)
     start_step = 0
     if resumed is not None:

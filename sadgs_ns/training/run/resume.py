@@ -82,11 +82,14 @@ class Resumption:
             pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
             extra = self.state["pipeline"]["_extra_state"]
             check_same_capture(pipeline, extra["images"], extra["camera_positions"])
+            if pipeline.model.poses is not None:  # The moments of earlier versions are in other units.
+                self.state["optimizers"].pop("camera_opt", None)
+                self.state.get("schedulers", {}).pop("camera_opt", None)
             others = sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys())
             if others:
                 raise InputError(
                     f"It optimized {' and '.join(others)}, too: set pipeline.model.color-model and "
-                    "pipeline.model.camera-optimizer.mode as they were."
+                    "pipeline.model.poses as they were, and train on one device."
                 )
 
     def load_optimizers(self, optimizers: Optimizers, schedulers: bool) -> None:

@@ -101,9 +101,9 @@ class SadgsTrainer(Trainer):
             raise SystemExit(128 + signal.SIGINT) from None
 
     def _can_replay_steps(self) -> bool:
-        """Tell whether steps of this run can be CUDA graphs: the host must not wait, and cameras must not move."""
+        """Tell whether steps of this run can be CUDA graphs: the host must not wait in them."""
         model = self.pipeline.model
-        if not self.config.cuda_graphs or model.camera_optimizer.config.mode != "off":
+        if not self.config.cuda_graphs:
             return False
         return self.world.is_single and model.backend == "triton" and model.tile_forecast is not None
 
@@ -219,7 +219,6 @@ class SadgsTrainer(Trainer):
         self.pipeline.record_step(step, groups, result)
         self.optimizers.scheduler_step_all(step)
         metrics: dict[str, Any] = {"psnr": result.psnr, "gaussian_count": model.num_gaussians}
-        model.camera_optimizer.get_metrics_dict(metrics)
         return result.loss, {"main_loss": result.loss}, metrics
 
     def _train_on(self, groups: list[ViewGroup]) -> StepResult:

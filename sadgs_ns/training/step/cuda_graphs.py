@@ -182,7 +182,7 @@ class GraphedSteps:
     ) -> tuple[Callable[[], Results], _Inputs] | None:
         """Return what replays such a step, and its inputs. The second step of a key is captured if there is memory."""
         sums = [value for value in self._model.strategy_state.values() if isinstance(value, Tensor)]
-        changed = (*update.parameters.values(), *update.exp_avgs, *update.exp_avg_sqs, *sums)
+        changed = (*update.tensors(), *sums)
         # New tensors of another length may have the old addresses.
         addresses = (len(update.parameters["means"]), *[tensor.data_ptr() for tensor in changed])
         if addresses != self._addresses:

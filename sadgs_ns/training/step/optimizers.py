@@ -18,6 +18,7 @@ from tyro.conf import Suppress
 from sadgs_ns.kernels import use_triton
 from sadgs_ns.training.options import hide
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT, leave_out_nonfinite
+from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
 
 _ONE = torch.tensor(1.0, device="cpu")  # Adding this to a count of steps takes a third of the time of adding Python's 1
 
@@ -37,33 +38,52 @@ class FusedAdam(Adam):
         super().__init__([parameter], fused=not use_triton(parameter.device), **options)
 
 
+class RowAdam(FusedAdam):
+    """Adam's state of a table, of which an update moves some rows (row_adam.py)."""
+
+
 class AdamUpdate:
     """An update of parameters, given by name, by our kernel, or else by torch's fused Adam, all on one device.
 
     One launch of the kernel updates all parameters of one length with equal betas and eps, which spares the host's
-    time. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
+    time. Tables with a `RowAdam` come last. Gradients of at least `nonfinite.MAX_GRADIENT`, or NaN, count as 0.
     """
 
     def __init__(self, optimizers: Mapping[str, Adam]) -> None:
         alike: dict[Any, dict[str, Adam]] = {}
+        self._tables = {name: adam for name, adam in optimizers.items() if isinstance(adam, RowAdam)}
         for name, optimizer in optimizers.items():
+            if name in self._tables:
+                continue
             group = optimizer.param_groups[0]
             alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
         self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
         self._optimizers = {name: adam for chosen in alike.values() for name, adam in chosen.items()}
+        self._optimizers |= self._tables
         self._groups = [adam.param_groups[0] for adam in self._optimizers.values()]
         present = (group["params"][0] for group in self._groups)
         self.parameters: dict[str, Tensor] = dict(zip(self._optimizers, present, strict=True))
         self.device = next(iter(self.parameters.values())).device
         self._triton = use_triton(self.device)
         self._states = [self._optimizers[name].state[parameter] for name, parameter in self.parameters.items()]
-        for state, parameter in zip(self._states, self.parameters.values(), strict=True):
-            if self._triton and not state:
+        for (name, parameter), state in zip(self.parameters.items(), self._states, strict=True):
+            if self._triton and not state and name not in self._tables:
                 state["step"] = torch.tensor(0.0)
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
+        for name, adam in self._tables.items():
+            table = self.parameters[name]
+            state = adam.state[table]
+            if not state:
+                state.update(empty_moments(table))
+            state["step"] = state["step"].to(table.device)  # A checkpoint's may be on the host.
         self.exp_avgs = tuple(state["exp_avg"] for state in self._states if state)
         self.exp_avg_sqs = tuple(state["exp_avg_sq"] for state in self._states if state)
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors that an update changes in place."""
+        counts = [adam.state[self.parameters[name]]["step"] for name, adam in self._tables.items()]
+        return [*self.parameters.values(), *self.exp_avgs, *self.exp_avg_sqs, *counts]
 
     def factors(self) -> Tensor:
         """Count an update of each parameter, and return our kernel's factors, on the (pinned) host. float32 [2, P]"""
@@ -72,7 +92,10 @@ class AdamUpdate:
         from sadgs_ns.kernels.adam import rate_and_scale
 
         columns = []
-        for state, group in zip(self._states, self._groups, strict=True):
+        for (name, group), state in zip(zip(self.parameters, self._groups, strict=True), self._states, strict=True):
+            if name in self._tables:  # The device counts the updates of each row.
+                columns.append((group["lr"], 1.0))
+                continue
             state["step"] = state["step"].cpu() + _ONE
             columns.append(rate_and_scale(int(state["step"]), group["lr"], group["betas"]))
         return torch.tensor(list(zip(*columns, strict=True)), pin_memory=self.device.type == "cuda")
@@ -84,13 +107,19 @@ class AdamUpdate:
         factors: Tensor,
         nonfinite_flag: Tensor,
         overflowed: tuple[Tensor, ...] = (),
+        rows: RowUpdate | None = None,
     ) -> None:
         """Update the parameters by gradients of their names; `nonfinite_flag` [1] becomes NaN if one was not finite.
 
         `factors` are on the device, and `overflowed` is as for `kernels.adam.adam_step`; torch's Adam ignores both.
+        `rows` say what of a table is moved; without them tables stay.
         """
+        if rows is not None:
+            self._move_tables(gradients, factors, nonfinite_flag, rows)
         if not self._triton:
             for name, optimizer in self._optimizers.items():
+                if name in self._tables:
+                    continue
                 leave_out_nonfinite(gradients[name], nonfinite_flag)
                 self.parameters[name].grad = gradients[name]
                 optimizer.step()
@@ -108,6 +137,21 @@ class AdamUpdate:
                 parameters, in_order, self.exp_avgs[part], self.exp_avg_sqs[part], factors[:, part], nonfinite_flag,
                 overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
+
+    def _move_tables(
+        self, gradients: Mapping[str, Tensor], factors: Tensor, nonfinite_flag: Tensor, rows: RowUpdate
+    ) -> None:
+        """Update the tables, whose factors are the last ones."""
+        first = len(self.parameters) - len(self._tables)
+        for place, (name, adam) in enumerate(self._tables.items(), first):
+            table = self.parameters[name]
+            group = adam.param_groups[0]
+            rate: Tensor | float = group["lr"]
+            if self._triton:
+                rate = factors[0, place]
+            move_rows(
+                table, gradients[name], adam.state[table], rows, rate, group["betas"], group["eps"], nonfinite_flag
+            )
 
 
 class SadgsOptimizers(Optimizers):
@@ -136,6 +180,16 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     """Learning rate; where there is a schedule, its factors multiply it."""
     eps: Suppress[float] = 1e-15
     """Adam adds this to the root of the second moment; as in 3DGS."""
+
+
+@hide("max_norm", "weight_decay")
+@dataclass
+class RowAdamOptimizerConfig(FusedAdamOptimizerConfig):
+    """Adam of the poses' corrections, of which a step moves those of its views."""
+
+    _target: type = RowAdam
+    lr: float = 0.05
+    """About how far a step moves the image of each of its views, in px; its schedule's factors multiply it."""
 
 
 @dataclass
@@ -171,3 +225,8 @@ class RunLengthDecayScheduler(Scheduler):
             return float(initial ** (1 - t) * final**t)
 
         return LambdaLR(optimizer, factor)
+
+
+def pose_optimizer() -> dict[str, Any]:
+    """Return Adam and the schedule of refined poses."""
+    return {"optimizer": RowAdamOptimizerConfig(), "scheduler": RunLengthDecaySchedulerConfig(final_factor=0.1)}

@@ -22,6 +22,7 @@ from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import stack, stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
+from sadgs_ns.training.step.row_adam import RowUpdate
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,12 @@ class ViewGroup:
     """Views of a step that have one size, on the training device."""
 
     indices: list[int]  # Indices of V training views
-    cameras: Cameras
+    cameras: Cameras  # With the initial poses
     options: RenderOptions
     data: Sequence[Mapping[str, Tensor]]
     """`image` of each view, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps `mask`, bool [H, W, 1]. With several
     processes, views that only others composite have none."""
-    view_ids: Tensor | None = None  # `indices` on the device if views have colour matrices. int64 [V]
+    view_ids: Tensor | None = None  # `indices` on the device if views have matrices or refined poses. int64 [V]
     structure_tensors: Tensor | None = None  # Quantized S̄ if η is observed. uint8 [V, H, W, 3]
     images: Tensor | None = None  # The images, if they are in one tensor already. [V, H, W, 3]
 
@@ -80,8 +81,6 @@ def training_step(
     world = model.strategy.world
     # Gradients of the parameters themselves would add up on the stream of their first use, where no graph is captured.
     leaves = {name: parameter.detach().requires_grad_() for name, parameter in model.trained_params.items()}
-    for name in update.parameters.keys() - leaves.keys():  # learned poses, which moved the groups' cameras
-        update.parameters[name].grad = None
     if not world.is_single:
         opacity_reg *= len(leaves["means"]) / world.total  # The mean is over the Gaussians of all processes.
     gaussians, penalty = model.gaussians(leaves, opacity_reg)
@@ -92,15 +91,13 @@ def training_step(
         losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, None)
         if penalty is not None:
             losses.append(penalty.sum())
-    pose_penalties: dict[str, Tensor] = {}
-    model.camera_optimizer.get_loss_dict(pose_penalties)
-    losses += pose_penalties.values()
     loss = reduce(torch.add, losses)
     loss.backward()
-    learned = {name: leaves.get(name, parameter) for name, parameter in update.parameters.items()}
-    gradients = {name: _gradient_of(leaf) for name, leaf in learned.items()}
+    gradients = {name: _gradient_of(leaves[name]) for name in update.parameters}
     overflowed = tuple(info["overflowed"] for info in infos if "overflowed" in info)
-    update.launch(gradients, factors, nonfinite_flag, overflowed)
+    update.launch(gradients, factors, nonfinite_flag, overflowed, _moved_poses(model, groups, infos))
+    if model.poses is not None:
+        model.poses.hold_frame()
     model.strategy.accumulate(model.strategy_state, model.step, infos)
     loss = loss.detach()
     if world.is_single:
@@ -131,13 +128,17 @@ def _render_and_compare(
     infos: list[dict[str, Any]] = []
     # All processes have the same groups, and autograd goes back through them in the same order.
     for group in groups:
-        pictures, info = rasterize(world, gaussians, group.cameras, group.options)
-        viewmats, Ks = group.cameras[:2]
+        cameras = group.cameras
+        if model.poses is not None and group.view_ids is not None:
+            moved = model.poses.viewmats(cameras.viewmats, group.view_ids, leaves["poses"])
+            cameras = cameras._replace(viewmats=moved)
+        pictures, info = rasterize(world, gaussians, cameras, group.options)
+        viewmats, Ks = cameras[:2]
         info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
         model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
         infos.append(info)
         for band, colors, alphas in pictures:
-            if group.view_ids is not None:
+            if model.has_view_colors and group.view_ids is not None:
                 view_ids = group.view_ids
                 if band is not None:
                     view_ids = view_ids[band.view : band.view + 1]
@@ -180,6 +181,16 @@ def _compare(
         ssim_lambda=ssim_lambda,
     )
     return loss, quality, 1
+
+
+def _moved_poses(
+    model: SadgsModel, groups: Sequence[ViewGroup], infos: Sequence[Mapping[str, Any]]
+) -> RowUpdate | None:
+    """Return which poses a step moves, those of the views that were drawn; None if poses are fixed."""
+    if model.poses is None:
+        return None
+    views = [group.view_ids for group in groups if group.view_ids is not None]
+    return model.poses.row_update(views, [info.get("overflowed") for info in infos])
 
 
 def _gradient_of(leaf: Tensor) -> Tensor:

@@ -153,19 +153,22 @@ class TrainingViews:
         return viewmats.to(device).unbind(), cameras.get_intrinsics_matrices().to(device).unbind()
 
     def viewmat(self, index: int) -> Tensor:
-        """World-to-camera matrix of a training view, corrected by the camera optimizer. [4, 4]"""
+        """World-to-camera matrix of a training view, as it is refined so far. [4, 4]"""
+        if self.model.poses is not None:
+            return self.model.poses.viewmat(index)
         viewmats, _ = self.cameras
-        optimizer = self.model.camera_optimizer
-        if optimizer.config.mode == "off":
-            return viewmats[index]
-        camera = self.datamanager.train_cameras[index : index + 1].to(self.model.device)
-        camera.metadata = {"cam_idx": index}
-        return viewmats_from_camera_to_world(optimizer.apply_to_camera(camera))[0]
+        return viewmats[index]
 
-    def stacked_cameras(self, indices: Sequence[int]) -> tuple[Tensor, Tensor]:
-        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views."""
-        _, every_K = self.cameras
-        viewmats = [self.viewmat(index) for index in indices]
+    def stacked_cameras(self, indices: Sequence[int], refined: bool = True) -> tuple[Tensor, Tensor]:
+        """World-to-camera matrices [V, 4, 4] and intrinsics in px [V, 3, 3] of V training views.
+
+        The matrices are as refined so far, or the initial ones.
+        """
+        initial, every_K = self.cameras
+        if refined:
+            viewmats = [self.viewmat(index) for index in indices]
+        else:
+            viewmats = [initial[index] for index in indices]
         Ks = [every_K[index] for index in indices]
         n = len(indices)
         if n == 1:

@@ -31,6 +31,7 @@ from helpers.short_runs import checkpoint, configure, is_finite, train
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.presets import sadgs
 from sadgs_ns.training.run import checkpoints
@@ -196,7 +197,10 @@ def test_cameras_that_see_nothing_are_refused(config: SadgsTrainerConfig):
 
 
 def test_a_scene_in_tiny_units_is_seen_since_its_near_plane_is_in_them(config: SadgsTrainerConfig):
+    config.pipeline.model.near_plane = "scene"
     plane = set_up(config).pipeline.model.plan.near_plane
+    config.pipeline.model.near_plane = "viewers"
+    assert set_up(config).pipeline.model.plan.near_plane == NEAR_PLANE < plane
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e-4)
     assert set_up(config).pipeline.model.plan.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)

@@ -173,7 +173,7 @@ def path_command(config: Path, folder: Path, text: str | bytes | None, **options
         ),
         (
             json.dumps(PATH | {"render_height": 0}),
-            r"A picture of 48 × 0 px was asked for: give the camera path a larger",
+            r"Camera 0 has 48 × 0 px: give it, or its path, a larger size\.",
         ),
     ],
 )

@@ -76,14 +76,13 @@ def assert_same_first_steps(results: list[dict[str, Any]], expected: dict[str, A
 
 
 @pytest.mark.hard_case(
-    "matrices of colours, camera optimizers or a paused start with several processes",
+    "matrices of colours or a paused start with several processes",
     "refused by name",
 )
 @pytest.mark.parametrize(
     ("option", "value"),
     [
         ("pipeline.model.color_model", "affine"),
-        ("pipeline.model.camera_optimizer.mode", "SO3xR3"),
         ("start_paused", True),
     ],
 )

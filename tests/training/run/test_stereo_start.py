@@ -138,7 +138,7 @@ def test_points_lie_where_two_views_are_not_masked(config: Any, scene: Path, tmp
 
 def test_the_paper_s_presets_start_as_the_paper_says():
     models: list[Any] = [p.config.pipeline.model for p in (presets.sadgs_paper, presets.sadgs_paper_indoor)]
-    assert [(m.stereo_points, m.clear_paths, m.near_plane) for m in models] == [(0, False, None)] * 2
+    assert [(m.stereo_points, m.clear_paths, m.near_plane) for m in models] == [(0, False, "scene")] * 2
 
 
 @pytest.mark.parametrize("asked", [True, False])

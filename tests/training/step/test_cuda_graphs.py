@@ -18,10 +18,11 @@ from helpers.interpreted_rasterizer import use_our_rasterizer
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import configure
 from sadgs_ns import kernels
+from sadgs_ns.render import backend_gsplat, backend_torch
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.run import exposure_start
 from sadgs_ns.training.run.trainer import SadgsTrainer
-from sadgs_ns.training.step import cuda_graphs, optimizers
+from sadgs_ns.training.step import cuda_graphs, optimizers, poses, row_adam
 from sadgs_ns.training.step.cuda_graphs import Results
 
 adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
@@ -64,7 +65,8 @@ class Reruns:
 def without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our rasterizer and Adam in Triton's interpreter, and graphs that are called again."""
     use_our_rasterizer(monkeypatch)
-    monkeypatch.setattr(optimizers, "use_triton", lambda place: True)
+    for module in (optimizers, poses, row_adam):
+        monkeypatch.setattr(module, "use_triton", lambda place: True)
     monkeypatch.setattr(cuda_graphs, "CudaGraphs", Reruns)
     monkeypatch.setattr(adam, "_BLOCK", 2**16)  # The interpreter runs one program after the other.
 
@@ -136,11 +138,19 @@ def choose_colors(config: SadgsTrainerConfig, colors: str, monkeypatch: pytest.M
 
 
 @on_cpu
-@pytest.mark.parametrize("color_model", ["none", "affine", "gains"])
+@pytest.mark.parametrize(
+    ("color_model", "poses_are"), [("none", "fixed"), ("affine", "fixed"), ("gains", "refined"), ("none", "refined")]
+)
 def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
-    color_model: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+    color_model: Any, poses_are: Any, without_cuda: None, short: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
+    def draw_otherwise(*_: Any) -> None:
+        raise AssertionError("Triton's kernels draw")
+
+    for backend in (backend_gsplat, backend_torch):
+        monkeypatch.setattr(backend, "project", draw_otherwise)
     choose_colors(short, color_model, monkeypatch)
+    short.pipeline.model.poses = poses_are
     short.pipeline.views_per_iteration = 2
     (launched, expected), (replayed, found) = run(short, False), run(short, True)
     assert launched.graphed is None and replayed.graphed is not None and not replayed.graphed.failure
@@ -149,6 +159,9 @@ def test_a_run_of_graphs_equals_one_of_launches_bit_for_bit(
     assert_equal(tensors(launched), tensors(replayed))
     assert (replayed.pipeline.model.exposure is not None) == (color_model == "gains")
     assert len({count for *_, count, _ in expected[1::2]}) > 2
+    if poses_are == "refined":
+        found_poses = replayed.pipeline.model.poses
+        assert found_poses is not None and (found_poses.table.detach() != 0).all()
 
 
 # --- one step ---
@@ -323,11 +336,11 @@ def test_steps_of_many_gaussians_or_of_masked_views_are_launched_one_by_one(
     "change",
     [
         lambda config: setattr(config, "cuda_graphs", False),
-        lambda config: setattr(config.pipeline.model.camera_optimizer, "mode", "SO3xR3"),
+        lambda config: setattr(config.pipeline.model, "backend", "torch"),
     ],
     ids=[
         "switched off",
-        "camera optimizer",
+        "another backend",
     ],
 )
 @on_cpu
