@@ -13,7 +13,6 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
-from nerfstudio.model_components import renderers
 from nerfstudio.models.splatfacto import SplatfactoModel
 from pytorch_msssim import SSIM
 from scipy.spatial import KDTree
@@ -39,7 +38,7 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.exposure_table import ExposureTable
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
-from sadgs_ns.training.outputs import LazyOutputs, in_viewer, rgba_image, warn_once
+from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.color_matrices import anchored
@@ -62,7 +61,6 @@ class SadgsModel(SplatfactoModel):
     plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
     gain_matrices: Tensor | None
-    get_rgba_image = staticmethod(rgba_image)
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
@@ -382,9 +380,7 @@ class SadgsModel(SplatfactoModel):
         """
         check_camera_types(camera)
         pinhole = self.pinhole(camera)
-        background = self.background
-        if renderers.BACKGROUND_COLOR_OVERRIDE is not None:  # A crop box has a colour of its own.
-            background = renderers.BACKGROUND_COLOR_OVERRIDE.to(background)
+        background = crop_background(self.background)
         rows = self.shown_rows(chosen)
         if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
@@ -443,6 +439,10 @@ class SadgsModel(SplatfactoModel):
             return outputs
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
+        return rgba_image(outputs, output_name)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""

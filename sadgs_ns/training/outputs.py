@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import Any
 
 import torch
+from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from sadgs_ns.training.run.progress import warn
@@ -27,6 +28,13 @@ class LazyOutputs(UserDict[str, Any]):
             value = value()
             self.data[name] = value
         return value
+
+
+def crop_background(background: Tensor) -> Tensor:
+    """Return the colour of the crop box that nerfstudio draws now, [3], or else the model's background [3]."""
+    if renderers.BACKGROUND_COLOR_OVERRIDE is None:
+        return background
+    return renderers.BACKGROUND_COLOR_OVERRIDE.to(background)
 
 
 def rgba_image(
