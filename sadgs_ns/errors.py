@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -27,6 +28,55 @@ _NERFSTUDIOS: dict[tuple[str, type[Exception], str], str] = {
     ("scripts.render.main", AssertionError, ""):
         "`ns-render spiral` does not work with methods that train on whole images, as this one and splatfacto do: use "
         "`ns-render interpolate`, or `ns-render camera-path` with a path that was drawn in the viewer.",
+    ("scripts.render._render_trajectory_video", AttributeError, "RayBundle"):
+        "--render-nearest-camera does not work with methods that train on whole images, as this one and splatfacto do: "
+        "leave it out, and copy the photo beside the picture.",
+    ("scripts.render._render_trajectory_video", ZeroDivisionError, ""):
+        "The camera path lasts 0 seconds: give it a longer duration in the viewer, or `seconds` in its file.",
+    **dict.fromkeys(
+        [
+            ("scripts.render.main", OSError, "RGBA"),
+            ("scripts.render._render_trajectory_video", OSError, "RGBA"),
+            ("scripts.render._render_trajectory_video", ValueError, "concatenation axis"),
+            ("scripts.render._render_trajectory_video", ValueError, "are invalid"),
+        ],
+        "`rgba` fits into PNG alone, and beside no other output: give --rendered-output-names rgba --image-format png, "
+        "and for a path --output-format images.",
+    ),
+    **dict.fromkeys(
+        [("scripts.render.main", FileNotFoundError, ""), ("scripts.render.main", IsADirectoryError, "")],
+        "{error.filename} cannot be read ({reason}): give --camera-path-filename the file of a path that was drawn in "
+        "the viewer.",
+    ),
+    **dict.fromkeys(
+        [
+            ("scripts.render.main", UnicodeDecodeError, ""),
+            ("scripts.render.main", json.JSONDecodeError, ""),
+            ("scripts.render.main", TypeError, "indices must be integers"),
+        ],
+        "The file that --camera-path-filename names is no camera path ({reason}): give a file that the viewer or the "
+        "add-on for Blender wrote.",
+    ),
+    **dict.fromkeys(
+        [
+            ("scripts.render.main", KeyError, "seconds"),
+            ("scripts.render.get_crop_from_json", KeyError, ""),
+            ("cameras.camera_paths.get_path_from_json", KeyError, ""),
+        ],
+        "The file that --camera-path-filename names is no camera path, because it lacks {reason}: give a file that the "
+        "viewer or the add-on for Blender wrote.",
+    ),
+    ("cameras.camera_paths.get_path_from_json", RuntimeError, "non-empty"):
+        "The file that --camera-path-filename names has no cameras: add keyframes to the path in the viewer, and save "
+        "it again.",
+    **dict.fromkeys(
+        [
+            ("cameras.camera_paths.get_path_from_json", Exception, ""),
+            ("scripts.render.get_crop_from_json", Exception, ""),
+        ],
+        "The file that --camera-path-filename names has a value that cannot be read ({reason}): save the path in the "
+        "viewer again.",
+    ),
     ("scripts.eval.main", AssertionError, ""):
         "--output-path must end with .json: give the file of results another name.",
     **dict.fromkeys(

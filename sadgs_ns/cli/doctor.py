@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes.util
+import getpass
 import importlib.util
 import os
 import platform
@@ -74,6 +75,7 @@ def check_machine() -> Iterator[Finding]:
     else:
         remedy = f"the first `ns-eval` downloads them to {weights}, or leaves it out"
         yield warning(f"LPIPS with AlexNet has no weights: {remedy}.")
+    yield from _check_user()
     for program, names, use in _NEEDED:
         found = _find_program(names.split())
         if found is not None:
@@ -82,6 +84,18 @@ def check_machine() -> Iterator[Finding]:
             yield note(f"{program} is missing: {use}.")
         else:
             yield warning(f"{program} is missing: {use}.")
+
+
+def _check_user() -> Iterator[Finding]:
+    """Check that the user has a name: torch's compiler, which nerfstudio imports, asks for it, as for its cache."""
+    if "TORCHINDUCTOR_CACHE_DIR" in os.environ:
+        return
+    try:
+        getpass.getuser()
+    except (KeyError, OSError):
+        problem = f"The user id {os.getuid()} has no name here, as in some containers"
+        remedy = "put USER=me before the commands, or `export USER=me`"
+        yield fault(f"{problem}, and nerfstudio's commands, such as `ns-train`, cannot start: {remedy}.")
 
 
 def _first_sentence(text: str) -> str:

@@ -17,6 +17,7 @@ from sadgs_ns import formats
 from sadgs_ns.cli.program import parse
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.files import check_encoding
 from sadgs_ns.formats import FORMATS, MESH, format_of, html
 from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, of_parameters
 from sadgs_ns.formats.mesh import load_open3d
@@ -281,6 +282,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
     options = parse(Export, "sadgs-export", argv)
     try:
+        check_encoding(options.run)
+        check_encoding(options.output)
         count = export(options)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)

@@ -16,6 +16,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.files import check_encoding
 from sadgs_ns.method.growth import absgs, apply
 from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -285,6 +286,7 @@ def inspect_run(
 
     Raise InputError as `load_run` and `get_view` before anything is written, and WriteError if a file cannot be.
     """
+    check_encoding(config)
     pipeline, iterations = load_run(config, load_step, data)
     model = pipeline.model
     shown = get_view(pipeline, view, split)

@@ -17,7 +17,7 @@ from sadgs_ns.cli.sadgs_folder import SadgsFolder, Settings
 from sadgs_ns.cli.sadgs_options import Sadgs, check_options, choose_formats
 from sadgs_ns.cli.status_line import StatusLine, Timeline
 from sadgs_ns.errors import InputError, RunError, WriteError
-from sadgs_ns.files import locked
+from sadgs_ns.files import check_encoding, locked
 from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
@@ -59,6 +59,7 @@ class PhotosToSplat:
         for path in (self.source, self.folder):
             if not str(path).isprintable():
                 raise InputError(f"{str(path)!a} has unprintable characters in its name: rename it.")
+            check_encoding(path)
         self.process = Process(self.source, self.results.scene, max_size=options.max_size)
         self.added = 0
         if self.given is not None:

@@ -41,7 +41,7 @@ def training_view(camera: Cameras) -> int | None:
 
 
 def check_camera_types(cameras: Cameras) -> None:
-    """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one.
+    """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one, or that has no pixel.
 
     nerfstudio gives full images of any camera type to a splatting model, and undistorts those of perspective and
     fisheye cameras with a distortion coefficient other than 0. Others would be rendered wrongly, as pinholes.
@@ -50,6 +50,10 @@ def check_camera_types(cameras: Cameras) -> None:
     for index, number in enumerate(cameras.camera_type.flatten().tolist()):
         camera_type = CameraType(number)
         where = f"Camera {index} is {camera_type.name}"
+        width = int(cameras.width.flatten()[index])
+        height = int(cameras.height.flatten()[index])
+        if min(width, height) < 1:
+            raise InputError(f"Camera {index} has {width} × {height} px: give it, or its path, a larger size.")
         if camera_type in _UNDISTORTED:
             if coefficients is None or not coefficients[index].any():
                 raise InputError(f"{where} {NO_COEFFICIENTS}")

@@ -27,6 +27,8 @@ UNREADABLE = (
 in others is not taken for damage."""
 NOT_UPRIGHT = range(2, 9)  # EXIF's orientations of turned or mirrored images. Pillow turns TIFF by itself, but no other
 SIDEWAYS = range(5, 9)  # Those of them that exchange the sides
+GREY_MODES = ("L", "1", "I;16", "I")
+"""Pillow's modes of images with one number a pixel, as masks have."""
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]  # Width and height in px
 
@@ -127,15 +129,11 @@ def read_small(path: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def is_flat(path: Path, black: bool = False) -> bool:
-    """Return whether all visible pixels have one colour, or are black if asked, as those of a mask may be.
-
-    A JPEG is decoded at an eighth of its size to find one colour.
-    """
+def is_flat(path: Path) -> bool:
+    """Return whether all visible pixels have one colour. A JPEG is decoded at an eighth of its size."""
     try:
         with Image.open(path) as image:
-            if not black:
-                image.draft(None, (image.width // 8, image.height // 8))
+            image.draft(None, (image.width // 8, image.height // 8))
             shown = image
             if image.mode == "RGBA":
                 shown = image.convert("RGBa")  # Transparent pixels become black.
@@ -145,9 +143,29 @@ def is_flat(path: Path, black: bool = False) -> bool:
     channels = extrema
     if not isinstance(extrema[0], tuple):  # The image has one channel.
         channels = [extrema]
-    if black:
-        return all(low == high == 0 for low, high in channels)
     return all(low == high for low, high in channels)
+
+
+def valid_pixels(mask: Image.Image) -> NDArray[np.bool_]:
+    """Return which pixels of an open mask are brighter than half of its brightest one; the others are hidden. [H, W]
+
+    Black may so be 16, as in video, or have noise, as in JPEG, and white may be 1. A mask of one value hides nothing
+    unless it is 0.
+    """
+    if mask.mode not in GREY_MODES:
+        mask = mask.convert("L")
+    values = np.asarray(mask)
+    return values > int(values.max()) // 2
+
+
+def is_uniform_mask(path: Path, valid: bool) -> bool:
+    """Return whether no pixel of a mask is hidden if `valid`, or else whether all are; False if it cannot be read."""
+    try:
+        with Image.open(path) as mask:
+            pixels = valid_pixels(mask)
+    except Exception:  # As in `is_flat`
+        return False
+    return bool((pixels == valid).all())
 
 
 def scaled_size(size: Size, factor: int, rounding: Rounding) -> Size:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
+from sadgs_ns.geometry.outliers import span_space
 
 POINTS_FILE = "points3D_file"
 """Key of a parser's metadata: the file of a COLMAP reconstruction from which all its points were read, in its order."""
@@ -85,8 +86,12 @@ def points_in_the_run(
 ) -> dict[str, Tensor]:
     """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them in the run's frame.
 
+    Points that span no space are left out, so that the run starts as without points.
+
     The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
     """
+    if not span_space(positions):
+        return {}
     with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite, and are left out later.
         positions = positions.astype(np.float32)
     homogeneous = torch.from_numpy(np.pad(positions, ((0, 0), (0, 1)), constant_values=1))  # [P, 4]

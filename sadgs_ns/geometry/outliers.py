@@ -13,6 +13,22 @@ POINT_SHARE = 0.99
 CAMERA_SHARE = 0.9
 """Share of the cameras that tells how far out a camera usually lies."""
 
+FEWEST_PLACES = 3
+"""Places of SfM points from which a run starts; fewer span no plane, and a splat that starts there shows next to
+nothing."""
+
+
+def span_space(
+    positions: NDArray[np.floating],  # [P, 3]
+) -> bool:
+    """Tell whether finite positions are in `FEWEST_PLACES` or more different places."""
+    others = positions[np.isfinite(positions).all(axis=-1)]
+    for _ in range(FEWEST_PLACES):
+        if len(others) == 0:
+            return False
+        others = others[(others != others[0]).any(axis=-1)]
+    return True
+
 
 def far_outliers(
     positions: NDArray[np.floating],  # [P, 3]

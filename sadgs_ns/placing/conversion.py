@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageCms, ImageOps
 
+from sadgs_ns.data.images import valid_pixels
 from sadgs_ns.errors import InputError
 from sadgs_ns.placing.bit_depth import read_scaled
 from sadgs_ns.placing.colours import profile_of
@@ -136,16 +137,19 @@ def write_alpha(folder: Path, photos: Sequence[Photo], alphas: Path) -> int:
 
 def write_masks(
     folder: Path, masks: Mapping[str, str], photos: Sequence[Photo], converted: Sequence[Photo], target: Path
-) -> None:
+) -> int:
     """Write a mask for each photo `NAME` as it was `converted`, `NAME.png` in `target`, a white one if it has none.
 
-    Raise InputError if a mask has another shape than its photo.
+    Return how many of them hide something. Raise InputError if a mask has another shape than its photo.
     """
+    num_hiding = 0
     names = iter(f"{photo.name}.png" for photo in converted)
     for photo in photos:
         mask = Image.new("L", photo.size, 255)
         if photo.name in masks:
             mask = _read_mask(folder / masks[photo.name], photo, folder / photo.name)
+        if mask.getextrema() != (255, 255):
+            num_hiding += 1
         parts = [mask]
         if photo.is_panorama:
             parts = cut(mask)
@@ -153,13 +157,13 @@ def write_masks(
             file = target / next(names)
             file.parent.mkdir(parents=True, exist_ok=True)
             part.save(file)
+    return num_hiding
 
 
 def _read_mask(file: Path, photo: Photo, photo_file: Path) -> Image.Image:
     """Read a mask, upright and in the photo's size, in black and white; raise InputError if it has another shape."""
     with Image.open(file) as image:
-        grey = np.asarray(image.convert("L"))
-    mask = Image.fromarray(np.uint8(255 * (grey > grey.max() // 2)))
+        mask = Image.fromarray(np.uint8(255 * valid_pixels(image)))
     width, height = photo.size
     lies_on_side = (mask.width > mask.height) != (width > height)
     if photo.is_turned and lies_on_side:  # It was made of the photo as that is stored.

@@ -20,10 +20,12 @@ from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings
 from sadgs_ns.placing.bands import other_bands
+from sadgs_ns.placing.video import is_archive
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
+_LONGEST_NAME = 255 - len(".jpg.png")  # Bytes of a name to which a conversion and its mask add these suffixes
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
@@ -54,8 +56,14 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
                 unused.append(f"Its photos ({len(photos)}, such as {photos[0]}) are not used: fewer than 3.")
             return videos, True, {}, [*unused, *others]
         problem = f"{source} holds {len(photos)} photos; a reconstruction needs at least 3, better 30 or more."
+        archives = [name for name in _visible_files(source) if is_archive(source / name)]
+        if archives:
+            problem += f" It holds archives ({len(archives)}, such as {archives[0]}): unpack them."
         raise InputError(" ".join([problem, *others]))
     for name in photos:
+        if any(len(os.fsencode(part)) > _LONGEST_NAME for part in name.split("/")):
+            problem = f"{source} holds a photo with a name of more than {_LONGEST_NAME} bytes, {name}"
+            raise InputError(f"{problem}: rename it, since its mask and its copies have longer names.")
         if re.search(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]", name):  # macOS puts a narrow space into names.
             raise InputError(f"{source} holds a photo with unprintable characters in its name, {name!a}: rename it.")
     return photos, False, masks, others

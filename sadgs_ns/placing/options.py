@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sadgs_ns.errors import InputError
+from sadgs_ns.files import check_encoding
 from sadgs_ns.placing.plan import Matching
 
 MIN_SIZE = 64  # Least longest side of the result in px; no structure is left in smaller images
@@ -36,7 +37,9 @@ class PlacingOptions:
     """Whether every photo has its own zoom, which EXIF does not tell."""
 
     def check(self) -> None:
-        """Raise InputError if a value is out of range."""
+        """Raise InputError if a value is out of range, or a path is not in UTF-8."""
+        check_encoding(self.source)
+        check_encoding(self.out)
         if self.frames < 3:
             raise InputError("--frames must be at least 3.")
         check_size(self.max_size)

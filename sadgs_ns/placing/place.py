@@ -193,11 +193,14 @@ def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> t
     else:
         has_masks = bool(masks)
     shutil.rmtree(scene.work / "masks", ignore_errors=True)
+    num_hiding = 0
     if has_masks:
-        write_masks(scene.options.source, masks, stored, photos, scene.work / "masks")
+        num_hiding = write_masks(scene.options.source, masks, stored, photos, scene.work / "masks")
     if masks:
-        if has_masks:
+        if num_hiding:
             use = "used"
+        elif has_masks:
+            use = "used, but hide nothing: make black what is to be hidden"
         else:
             use = "not used, because the scene has none: give another folder for it"
         say("aside", f"Masks of {len(masks)} photos are {use}.")

@@ -15,24 +15,45 @@ from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
 
 _HDR = (16, 18)  # FFmpeg's numbers of PQ and HLG, in which phones record unless they are told otherwise
+_ARCHIVES = {b"PK\x03\x04": 0, b"7z\xbc\xaf": 0, b"Rar!": 0, b"\x1f\x8b": 0, b"\xfd7zXZ": 0, b"BZh": 0, b"ustar": 257}
+"""What archives hold at which byte: ZIP, 7z, RAR, gzip, xz, bzip2 and tar."""
 _BT_709 = 1  # FFmpeg's number of this matrix from colours to luma and chroma
 _NO_MATRIX = 2  # FFmpeg's number of a frame that names none
 _HD_SIZE = (1280, 720)  # Width and height in px, either of which makes a video HD
 
 
+def is_archive(path: Path) -> bool:
+    """Return whether a file is a ZIP or another archive by its content; False if it cannot be read."""
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        start = file.read(512)
+        return any(start[place:].startswith(signature) for signature, place in _ARCHIVES.items())
+    return False
+
+
 def count_frames(video: Path) -> int:
-    """Return the number of a video's frames, which recordings do not tell; raise InputError if it is no video."""
+    """Return the number of a video's frames, which recordings do not tell; raise InputError if it is no video.
+
+    FFmpeg takes archives of JPEGs, single images and texts for videos, too; these are refused.
+    """
     import av
 
+    if is_archive(video):
+        raise InputError(f"{video} is an archive: unpack it, and give the folder of its photos or videos.")
+    remedy = "give a folder of photos or of videos, or convert a video to MP4 with H.264."
     try:
         with av.open(os.fspath(video)) as container:
+            kind = container.format.name
             stream = container.streams.best("video")
             assert isinstance(stream, av.VideoStream)
-            return stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
+            number = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
     except Exception as error:  # FFmpeg has many.
         why = getattr(error, "strerror", None) or "it shows nothing"
-        remedy = "give a folder of photos or of videos, or convert a video to MP4 with H.264."
         raise InputError(f"{video} cannot be read as a video ({why}); {remedy}") from error
+    if kind == "image2" or kind.endswith("_pipe"):
+        raise InputError(f"{video} is a single image, and a reconstruction needs at least 3; give their folder.")
+    if kind == "tty":
+        raise InputError(f"{video} cannot be read as a video (it is a text); {remedy}")
+    return number
 
 
 def read_frames(stream: Any) -> Iterator[Any]:

@@ -6,6 +6,7 @@ import copy
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -41,9 +42,12 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = requested
         for dataset in (self.train_dataset, self.eval_dataset):
+            _make_paths(dataset)
             splits.check_paths(dataset.image_filenames)
             mark_training_views(dataset.cameras, dataset.image_filenames, self.train_dataset.image_filenames)
             _check_sizes(dataset)
+            if type(self).setup_train.__module__ == "nerfstudio.scripts.render":  # `ns-render dataset` replaces it.
+                _check_stems(dataset.image_filenames)
 
     def create_eval_dataset(self) -> InputDataset:
         """Make the dataset without reading the points again; nothing uses them."""
@@ -93,6 +97,26 @@ def _check_names(config: FullImageDatamanagerConfig, parser: ColmapDataParserCon
     if source.is_file():
         names = (name for name, _, _ in colmap.read_poses(source))
         splits.check_names(names, source)
+
+
+def _make_paths(dataset: InputDataset) -> None:
+    """Make paths of the names of images and masks, which some parsers give as texts."""
+    outputs = dataset._dataparser_outputs
+    outputs.image_filenames = [Path(name) for name in outputs.image_filenames]
+    if outputs.mask_filenames is not None:
+        outputs.mask_filenames = [Path(name) for name in outputs.mask_filenames]
+
+
+def _check_stems(names: Sequence[Path]) -> None:
+    """Raise InputError for images that differ in their suffix alone: `ns-render` would write one file for both."""
+    first_of: dict[Path, Path] = {}
+    for name in names:
+        first = first_of.setdefault(name.with_suffix(""), name)
+        if first != name:
+            raise InputError(
+                f"{first} and {name} differ in their suffix alone, so that `ns-render dataset` would write one over "
+                "the other: give one another name, there and in its poses."
+            )
 
 
 def _place(data: dict[str, Any], where: str, device: torch.device) -> dict[str, Any]:

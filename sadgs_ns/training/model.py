@@ -38,7 +38,7 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.exposure_table import ExposureTable
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
-from sadgs_ns.training.outputs import LazyOutputs, in_viewer, warn_once
+from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.color_matrices import anchored
@@ -380,7 +380,7 @@ class SadgsModel(SplatfactoModel):
         """
         check_camera_types(camera)
         pinhole = self.pinhole(camera)
-        background = self.background
+        background = crop_background(self.background)
         rows = self.shown_rows(chosen)
         if rows is not None and not rows.any():
             return self.get_empty_outputs(pinhole.width, pinhole.height, background)
@@ -395,7 +395,8 @@ class SadgsModel(SplatfactoModel):
 
     def pinhole(self, camera: Cameras) -> Pinholes:
         """Return nerfstudio's camera, shape [1], as the rasterizer takes it, that of a training view as refined."""
-        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds).to(self.device)
+        # Poses of a camera path may be whole numbers.
+        viewmats = viewmats_from_camera_to_world(camera.camera_to_worlds.float()).to(self.device)
         view = training_view(camera)
         if self.poses is not None and view is not None:
             viewmats = self.poses.viewmat(view)[None]
@@ -438,6 +439,10 @@ class SadgsModel(SplatfactoModel):
             return outputs
         params = self.cropped(dict(self.gauss_params.items()))
         return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
+
+    def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
+        """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
+        return rgba_image(outputs, output_name)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Return an image, uint8 or floats in [0, 1] [H, W, 3 or 4], on the device and in [0, 1], in one launch."""

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections import UserDict
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
+import torch
+from nerfstudio.model_components import renderers
 from torch import Tensor
 
 from sadgs_ns.training.run.progress import warn
@@ -25,6 +28,24 @@ class LazyOutputs(UserDict[str, Any]):
             value = value()
             self.data[name] = value
         return value
+
+
+def crop_background(background: Tensor) -> Tensor:
+    """Return the colour of the crop box that nerfstudio draws now, [3], or else the model's background [3]."""
+    if renderers.BACKGROUND_COLOR_OVERRIDE is None:
+        return background
+    return renderers.BACKGROUND_COLOR_OVERRIDE.to(background)
+
+
+def rgba_image(
+    outputs: Mapping[str, Tensor],  # Of the model, each [H, W, C]
+    output_name: str = "rgb",
+) -> Tensor:
+    """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
+    alpha = outputs["accumulation"]
+    seen = outputs[output_name] - (1 - alpha) * outputs["background"]
+    color = torch.where(alpha > 0, seen / alpha, 0.0)
+    return torch.cat([color.clamp(0.0, 1.0), alpha], dim=-1)
 
 
 def in_viewer() -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes.util
+import getpass
 import importlib.util
+import os
 import re
 import shutil
 import sys
@@ -34,6 +36,25 @@ def about(word: str) -> tuple[str, str]:
     """The only finding that holds a word: severity and sentence."""
     ((sentence, severity),) = [(s, severity) for s, severity in machine().items() if word in s]
     return severity, sentence
+
+
+@pytest.mark.hard_case("a user id without a line in passwd, as in containers", "an error that says what to set")
+@pytest.mark.parametrize("error", [KeyError("uid not found"), OSError("no username")])
+def test_a_user_without_a_name_is_told(error: Exception, monkeypatch: pytest.MonkeyPatch):
+    def nobody() -> str:
+        raise error
+
+    monkeypatch.setattr(getpass, "getuser", nobody)
+    monkeypatch.delenv("TORCHINDUCTOR_CACHE_DIR", raising=False)
+    (finding,) = doctor._check_user()
+    assert finding.severity == "error"
+    assert finding.sentence == (
+        f"The user id {os.getuid()} has no name here, as in some containers, and nerfstudio's commands, such as "
+        "`ns-train`, cannot start: put USER=me before the commands, or `export USER=me`."
+    )
+    assert ("error", finding.sentence) == about("has no name here")
+    monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", "/tmp")
+    assert list(doctor._check_user()) == []
 
 
 @pytest.fixture

@@ -50,7 +50,8 @@ def beside_a_reconstruction(scene: Path, data: Path) -> None:
     nerfstudio_data(data)
     model = data / "colmap/sparse/0"
     shutil.copytree(scene / SPARSE_FOLDER, model, ignore=shutil.ignore_patterns("points3D.*"))
-    (model / "points3D.txt").write_text("1 0.5 0.5 -0.5 90 90 90 0\n")  # The scene's points are not of these photos.
+    points = [f"{i} 0.5 0.5 {-0.5 + 0.01 * i} 90 90 90 0\n" for i in range(1, 5)]
+    (model / "points3D.txt").write_text("".join(points))  # The scene's points are not of these photos.
 
 
 def named_with_folder(scene: Path, data: Path) -> None:

@@ -35,7 +35,7 @@ from helpers.drawn_photos import color_profile
 from helpers.forked_python import HANGS
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import blender_data, configure, is_finite, nerfstudio_data, train
-from helpers.small_scenes import HEIGHT, WIDTH
+from helpers.small_scenes import HEIGHT, POINTS, WIDTH
 from sadgs_ns.cli import doctor
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import capture, check_data
@@ -973,7 +973,7 @@ def test_views_from_a_tripod_are_as_good_as_others(copied: Callable[[str], Path]
             frame["transform_matrix"][0][3] += 1e-15 * index + 0.3 * (index == 5)
 
     meta(move)(data)
-    with_points([[0.5, 0.5, 0.5]] * 4)(data)
+    with_points([[0.5, 0.5, 0.5 + 0.01 * i] for i in range(4)])(data)
     assert [finding for finding in check_data(data) if finding.severity != "note"] == []
 
 
@@ -1018,6 +1018,21 @@ def test_an_orientation_that_a_size_tells_of_is_no_warning(copied: Callable[[str
         store_turned((side, HEIGHT), 8)(data)
         meta(lambda m, side=side: [frame.update(w=side, cx=side / 2) for frame in [*m["frames"], m]])(data)
         assert sum("EXIF orientation" in finding.sentence for finding in remarks(data)) == told
+
+
+@pytest.mark.hard_case("masks that hide nothing in any image", "a warning")
+@pytest.mark.parametrize("color", [255, 1])
+def test_masks_that_hide_nothing_are_told(color: int, copied: Callable[[str], Path]):
+    data = copied("nerfstudio")
+    mask("L", color)(data)
+    (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert finding.severity == "warning"
+    problem = f"{data}/transforms.json has 10 masks that hide nothing, such as {data}/mask.png"
+    assert finding.sentence.startswith(f"{problem}: make black what is to be hidden")
+    with Image.open(data / "mask.png") as image:
+        image.putpixel((3, 3), 0)
+        image.save(data / "mask.png")
+    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
 
 
 @pytest.mark.hard_case("several bad images", "one sentence for each kind: the first, and how many more")
@@ -1127,12 +1142,45 @@ def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
 @pytest.mark.hard_case("points that fewer than half of the cameras see", "a warning")
 def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
-    with_points([[0.5, 0.5, 0.5]] * 4)(data)
+    with_points([[0.5, 0.5, 0.5 + 0.01 * i] for i in range(4)])(data)
     assert [finding for finding in check_data(data) if finding.severity != "note"] == []
     change_poses(*range(6), times=np.diag([1.0, -1, -1, 1]))(data)  # OpenCV's axes instead of OpenGL's
     (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
     assert finding.severity == "warning"
     assert re.fullmatch(r"\S+/p\.ply has points that only 40% of the cameras can see .*\.", finding.sentence)
+
+
+@pytest.mark.hard_case("two SfM points, or 40 in one place", "a warning, and the run starts as without points")
+@pytest.mark.parametrize("layout", ["nerfstudio", "colmap", "blender"])
+@pytest.mark.parametrize("number", [2, 40])
+def test_points_that_span_no_space_are_told_and_not_started_from(
+    number: int, layout: str, copied: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    data = copied(layout)
+    places = [[0.5, 0.5, 0.5]] * (number - 1) + [[0.5, 0.5, 0.6]]
+    if layout == "colmap":
+
+        def keep_some(cameras: Any, images: Any, points: Any) -> None:
+            for index in list(points)[number:]:
+                del points[index]
+            for index, place in zip(list(points), places, strict=True):
+                points[index] = points[index]._replace(xyz=np.array(place))
+
+        model(keep_some)(data)
+    elif layout == "nerfstudio":
+        with_points(places)(data)
+    parser: Any = parser_of(data)
+    if layout == "blender":
+        lines = "".join("{} {} {}\n".format(*place) for place in places)
+        (data / "p.ply").write_text(PLY.format(len(places)) + lines)
+        parser.ply_path = Path("p.ply")
+    config = configure(tmp_path / "out", parser, iterations=2)
+    pipeline = set_up(config).pipeline
+    assert pipeline.model.seed_points is None
+    assert POINTS / 2 < pipeline.model.num_gaussians <= POINTS  # Those near the cameras' paths are left out.
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "has SfM points in fewer than 3 places, which say too little about the scene: training starts as" in printed
+    assert "The data has no SfM points: starting from" in printed
 
 
 @pytest.mark.hard_case("points beside a Blender scene (`--ply-path`)", "checked as those of other data")
@@ -1270,8 +1318,7 @@ def test_cameras_of_several_models_and_sizes_train_together(copied: Callable[[st
 
 
 @pytest.mark.hard_case(
-    "masks of 1, 8 or 16 bits; grey images, or with alpha, among RGB; one mask black; one pixel unmasked; 3 "
-    "equal points",
+    "masks of 1, 8 or 16 bits; grey images, or with alpha, among RGB; one mask black; one pixel unmasked; 4 points",
     "trains, finite",
 )
 def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable[[str], Path], tmp_path: Path):
@@ -1285,7 +1332,7 @@ def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable
         image.putpixel((20, 20), 255)
         image.save(data / "mask3.png")  # of a single pixel
     meta(lambda m: [frame.update(mask_path=f"mask{k % 5}.png") for k, frame in enumerate(m["frames"])])(data)
-    with_points([[0, 0, 0]] * 3)(data)
+    with_points([[0, 0, 0.01 * i] for i in range(4)])(data)
     assert [finding for finding in check_data(data) if finding.severity != "note"] == []
     config = configure(tmp_path / "out", parser_of(data), iterations=8)
     config.pipeline.views_per_iteration = 2

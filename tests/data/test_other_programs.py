@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import re
@@ -171,12 +172,18 @@ def test_what_lies_beside_a_transforms_json_unnamed_is_told(name: str, told: str
 
 
 @pytest.mark.hard_case(
-    "a Blender scene of D-NeRF, whose frames have a `time`", "trains as one moment, with a warning; it did in silence"
+    "a `transforms.json`, or a Blender scene of D-NeRF, whose frames have a `time`",
+    "trains as one moment, with a warning, unless the times are equal",
 )
-def test_a_scene_that_moves_is_told(write: Callable[..., Path]):
-    data = write(of_frame=lambda frame: frame.update(time=0.5), kind="blender")
+@pytest.mark.parametrize(("kind", "file"), [("transforms", "transforms.json"), ("blender", "transforms_train.json")])
+def test_a_scene_that_moves_is_told(kind: str, file: str, write: Callable[..., Path]):
+    times = itertools.count()
+    data = write(of_frame=lambda frame: frame.update(time=next(times) / 10), kind=kind)
     (warning,) = [finding.sentence for finding in check_data(data) if finding.severity == "warning"]
-    assert warning.startswith(f"{data}/transforms_train.json gives each frame a time, as of a scene that moves, and ")
+    assert warning.startswith(f"{data}/{file} gives each frame a time, as of a scene that moves, and ")
+    shutil.rmtree(data)
+    data = write(of_frame=lambda frame: frame.update(time=0.5), kind=kind)
+    assert [finding for finding in check_data(data) if finding.severity == "warning"] == []
 
 
 @pytest.mark.hard_case(

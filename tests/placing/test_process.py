@@ -56,7 +56,7 @@ from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_ma
 from sadgs_ns.placing.publishing import publish
 from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
 from sadgs_ns.placing.scene import Scene
-from sadgs_ns.placing.video import sharpest_frames, video_frames
+from sadgs_ns.placing.video import count_frames, sharpest_frames, video_frames
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 from sadgs_ns.worker import Worker
 
@@ -394,6 +394,33 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
     printed = capsys.readouterr().err
     assert sentence in printed and printed.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case("a ZIP or tar of photos, or a folder with one, instead of photos", "refused: unpack it")
+@pytest.mark.parametrize("kind", ["zip", "tar", "gztar"])
+def test_an_archive_of_photos_is_no_video(kind: str, tmp_path: Path, capsys):
+    """FFmpeg takes an archive in which JPEGs are stored for a video of these."""
+    (tmp_path / "photos").mkdir()
+    for i, photo in enumerate(itertools.islice(draw_photos(), 5)):
+        photo.save(tmp_path / "photos" / f"{i}.jpg")
+    archive = Path(shutil.make_archive(str(tmp_path / "archives" / "photos"), kind, tmp_path / "photos"))
+    assert main([str(archive), str(tmp_path / "out")]) == 2
+    sentence = f"{archive} is an archive: unpack it, and give the folder of its photos or videos."
+    assert capsys.readouterr().err == f"sadgs-process: {sentence}\n"
+    assert main([str(archive.parent), str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case("a single photo, or a text, instead of photos", "refused")
+def test_what_ffmpeg_alone_takes_for_a_video_is_none(tmp_path: Path):
+    photo = next(iter(draw_photos()))
+    (tmp_path / "a.txt").write_text("a letter\n" * 1000)
+    for name, problem in (("a.jpg", "is a single image"), ("a.png", "is a single image"), ("a.txt", "it is a text")):
+        if not (tmp_path / name).exists():
+            photo.save(tmp_path / name)
+        with pytest.raises(InputError, match=problem):
+            count_frames(tmp_path / name)
 
 
 def heic(folder: Path) -> None:
@@ -791,6 +818,36 @@ def test_the_brighter_colour_of_a_mask_is_white(bright: tuple[int, int, int], tm
     for i, name in enumerate(photos):
         white = np.asarray(Image.open(tmp_path / "written" / f"{name}.png"))
         assert not white[:, : 40 + i].any() and (white[:, 40 + i :] == 255).all()
+
+
+@pytest.mark.hard_case("photos' masks in which black is 16, in 8 or 16 bits", "black is hidden")
+@pytest.mark.parametrize(("kind", "unit"), [(np.uint8, 1), (np.uint16, 256)])
+def test_a_mask_s_black_need_not_be_0(kind: type, unit: int, tmp_path: Path):
+    values = np.full((HEIGHT, WIDTH), 235 * unit, kind)
+    values[:, :40] = 16 * unit
+    Image.fromarray(values).save(tmp_path / "mask.png")
+    photo = Photo("a.png", (WIDTH, HEIGHT), (), False)
+    for name, num_hiding in (("mask.png", 1), ("white.png", 0)):
+        Image.new("L", photo.size, 255).save(tmp_path / "white.png")
+        assert write_masks(tmp_path, {"a.png": name}, [photo], [photo], tmp_path / name[:4]) == num_hiding
+    with Image.open(tmp_path / "mask" / "a.png.png") as mask:
+        assert (np.asarray(mask) == np.where(values > 128 * unit, 255, 0)).all()
+
+
+@pytest.mark.hard_case("photos with names of 248 bytes and more", "refused by name before any work")
+def test_a_name_that_leaves_no_room_for_a_suffix_is_refused(tmp_path: Path, capsys):
+    """A conversion and its mask have the suffixes .jpg.png more, and the file system ends at 255 bytes."""
+    for length, name in ((247, "a" * 243 + ".png"), (248, "é" * 122 + ".png")):
+        photos = tmp_path / str(length)
+        black(photos, name, "b.png", "c.png")
+        assert len(os.fsencode(name)) == length
+        if length == 247:
+            assert name in find_source(photos, tmp_path / "out")[0]
+        else:
+            assert main([str(photos), str(tmp_path / "out")]) == 2
+            sentence = f"{photos} holds a photo with a name of more than 247 bytes, {name}: rename it, since its mask"
+            assert f"sadgs-process: {sentence} and its copies have longer names.\n" == capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.hard_case("a mask of a panorama", "is cut into masks of its views")

@@ -12,11 +12,13 @@ from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, collect_findings
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.data.layouts import ParserOptions, automatic_options, layout_of
+from sadgs_ns.files import check_encoding
 
 
 @collect_findings
 def check_data(data: Path) -> Iterator[Finding]:
     """Return findings on a folder, or on a `transforms.json`, as `ns-train` reads it where no parser is named."""
+    check_encoding(data)
     layout = layout_of(data)
     if layout == "colmap":
         yield from check_colmap(data, automatic_options(data))

@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import copy
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from nerfstudio.configs.dataparser_configs import all_dataparsers
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, check_findings
+from sadgs_ns.data.checks.geometry import check_times
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
 from sadgs_ns.data.layouts import ParserOptions
+from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
+from sadgs_ns.errors import InputError, reason
+from sadgs_ns.files import check_encoding
 
 CHECKS = {
     ColmapDataParserConfig: check_colmap,
     NerfstudioDataParserConfig: check_nerfstudio,
     BlenderDataParserConfig: check_blender,
 }
-"""The check of each parser's data; other parsers' data are not checked."""
+"""The check of each parser's data; other parsers' data are parsed as a trial."""
 
 
 def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) -> list[Finding]:
@@ -33,6 +40,7 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
     choose_parser(config)
     parser = config.dataparser
     data = Path(config.data or parser.data)
+    check_encoding(data)
     names = [field.name for field in fields(ParserOptions) if hasattr(parser, field.name)]
     options = ParserOptions(**{name: getattr(parser, name) for name in names})
     for kind, check in CHECKS.items():
@@ -40,7 +48,47 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
             findings = check(data, options, open_images)
             check_findings(findings, data)
             return findings
-    return []
+    if not open_images:
+        return []
+    return _parse_on_trial(parser, data)
+
+
+def _parse_on_trial(config: DataParserConfig, data: Path) -> list[Finding]:
+    """Let a parser whose data has no check read it, and return the findings; raise InputError if it cannot.
+
+    These parsers raise anything where a folder is not of their kind.
+    """
+    parser = copy.copy(config)
+    parser.data = data
+    parser._target = OWN.get(parser._target, parser._target)
+    kind = type(config)
+    name = next((name for name, other in all_dataparsers.items() if type(other) is kind), kind.__name__)
+    remedy = (
+        "give --data the folder that this parser is for, or leave the parser out for transforms.json, COLMAP and "
+        "Blender data"
+    )
+    findings = []
+    for split in ("train", "val"):
+        try:
+            outputs = parser.setup().get_dataparser_outputs(split)
+        except (InputError, MemoryError):
+            raise
+        except Exception as error:
+            raise InputError(f"{data} cannot be read by {name} ({_cause(error)}): {remedy}.") from error
+        if split == "train":
+            if len(outputs.image_filenames) == 0:
+                raise InputError(f"{name} finds no image to train on in {data}: {remedy}.")
+            if outputs.cameras.times is not None:
+                findings += check_times(outputs.cameras.times.flatten().tolist(), data)
+    return findings
+
+
+def _cause(error: Exception) -> str:
+    """Return the kind of an error, its first line, and the file that it is about if it names one."""
+    file = ""
+    if isinstance(error, OSError) and error.filename is not None:
+        file = f": {os.fsdecode(error.filename)}"
+    return f"{type(error).__name__}: {reason(error)}{file}"
 
 
 @dataclass(frozen=True)

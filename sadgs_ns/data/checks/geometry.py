@@ -6,6 +6,7 @@ import math
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warnin
 from sadgs_ns.data.images import read_small
 from sadgs_ns.data.views import NO_COEFFICIENTS, Camera, View
 from sadgs_ns.errors import InputError
-from sadgs_ns.geometry.outliers import CAMERA_SHARE, POINT_SHARE, REACH, far_outliers
+from sadgs_ns.geometry.outliers import CAMERA_SHARE, FEWEST_PLACES, POINT_SHARE, REACH, far_outliers, span_space
 
 _FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, which then have 1,000 float32 steps
 _WIDEST = 170.0  # Angle of view in degrees under which lenses without fisheye stay
@@ -46,6 +47,13 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
         findings += _check_camera(camera, where)
     yield from findings
     return all(finding.severity != "error" for finding in findings)
+
+
+def check_times(times: Sequence[Any], source: object) -> Iterator[Finding]:
+    """Warn of views that a source gives different times, since training takes all as of one moment."""
+    if len({str(time) for time in times}) > 1:
+        problem = f"{source} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
+        yield warning(f"{problem}: what moves will blur, so keep the frames of one time if you can.")
 
 
 def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
@@ -189,6 +197,11 @@ def check_points(points: colmap.Points, views: Sequence[View], path: Path, remed
         yield fault(f"{path} holds no SfM point: {remedy}.")
     else:
         yield note(f"{path} has {len(positions):,} points.")
+        if not span_space(positions):
+            problem = (
+                f"{path} has SfM points in fewer than {FEWEST_PLACES} places, which say too little about the scene"
+            )
+            yield warning(f"{problem}: training starts as without points; {remedy}.")
         if views:
             yield from _check_distances(positions, views, path)
             yield from _check_colors(points, views, path, remedy)

@@ -11,14 +11,13 @@ from pathlib import Path, PureWindowsPath
 from sadgs_ns.data import images
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
 
-MASK_MODES = ("L", "1", "I;16", "I")  # Pillow's modes of masks; nerfstudio trains on every pixel that is not 0
 _TURN = "turn their pixels as those poses want it, and take the tag away, as ImageMagick's `mogrify -auto-orient` does"
 
 
 def check_images(frames: Sequence[images.Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
     """Check the images and masks of frames from a source, and say in a note how many and of what kind they are.
 
-    Images are decoded until one shows something, and masks until one leaves a pixel to train on. If asked, a warning
+    Images are decoded until one shows something, and masks until one hides a part. If asked, a warning
     tells of images beside the frames' that no frame uses.
     """
     with ThreadPoolExecutor() as pool:
@@ -42,9 +41,7 @@ def check_images(frames: Sequence[images.Frame], source: Path, look_for_unused: 
     if all(images.is_flat(frame.image) for frame in frames):
         problem = f"{source} has {len(frames)} images that show a single colour and nothing else"
         yield fault(f"{problem}, such as {frames[0].image}: export them again.")
-    if all(frame.mask is not None and images.is_flat(frame.mask, black=True) for frame in frames):
-        problem = f"{source} has {len(frames)} masks that are all black, such as {frames[0].mask}"
-        yield fault(f"{problem}, which leaves no pixel to train on: make white what is to be trained on.")
+    yield from _check_masks(frames, source)
     yield from _check_headers(frames, headers)
     yield note(_describe(source, headers, masks))
 
@@ -54,6 +51,19 @@ def _check_unused(frames: Sequence[images.Frame], source: Path) -> Iterator[Find
     if unused:
         where = and_more(unused[0], len(unused))
         yield warning(f"{where} has no pose in {source} and is not used: reconstruct again if it matters.")
+
+
+def _check_masks(frames: Sequence[images.Frame], source: Path) -> Iterator[Finding]:
+    """Check that good masks of all frames leave a pixel to train on, and hide one."""
+    masks = [frame.mask for frame in frames if frame.mask is not None]
+    if not masks or len(masks) < len(frames):
+        return
+    if all(images.is_uniform_mask(mask, valid=False) for mask in masks):
+        problem = f"{source} has {len(masks)} masks that are all black, such as {masks[0]}"
+        yield fault(f"{problem}, which leaves no pixel to train on: make white what is to be trained on.")
+    if all(images.is_uniform_mask(mask, valid=True) for mask in masks):
+        problem = f"{source} has {len(masks)} masks that hide nothing, such as {masks[0]}"
+        yield warning(f"{problem}: make black what is to be hidden, which is what is darker than half of the white.")
 
 
 def _check_headers(frames: Sequence[images.Frame], headers: Sequence[images.Header]) -> Iterator[Finding]:
@@ -105,7 +115,7 @@ def _problem(
         return None
     if mask.problem:
         return mask.problem.split(" (")[0], frame.mask, mask.problem
-    if mask.mode not in MASK_MODES:
+    if mask.mode not in images.GREY_MODES:
         return "mask mode", frame.mask, f"is a mask of Pillow's mode {mask.mode}: convert it to 8-bit grey"
     if mask.size != image.size:
         return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"

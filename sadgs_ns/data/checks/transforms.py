@@ -65,6 +65,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     names = [frame["file_path"] for frame in described]
     lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
     training = yield from check_splits(names, lists, lambda split: f"{path}: {split}_filenames", locate, options)
+    yield from geometry.check_times(_times(described), path)
     sound = yield from geometry.check_views(views, training, path)
     if 3 <= training == len(frames) < 10:  # With more frames all are trained on only where that was asked for.
         yield note(f"{path} has {training} views, none of them held out: `ns-eval` cannot measure any.")
@@ -107,6 +108,11 @@ def _view(frame: dict[str, Any], where: str, camera: Camera, image: Path, open_i
     if open_image:
         return view_of(frame, where, camera, image)
     return view_of(frame, where, camera, None)
+
+
+def _times(frames: Sequence[dict[str, Any]]) -> list[Any]:
+    """Return the times of frames that have one."""
+    return [frame["time"] for frame in frames if "time" in frame]
 
 
 def _check_all_or_none(frames: Sequence[dict[str, Any]], key: str, files: str, path: Path) -> None:
@@ -158,9 +164,8 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
             )
         meta = read_blender(path)
         described = meta["frames"]
-        if "time" in described[0] and split == "train":
-            problem = f"{path} gives each frame a time, as of a scene that moves, and all are trained as of one moment"
-            yield warning(f"{problem}: what moves will blur, so keep the frames of one time if you can.")
+        if split == "train":
+            yield from geometry.check_times(_times(described), path)
         paths = blender_images(described, data)
         size = images.image_size(paths[0])  # The cameras have no size of their own.
         if not any(size):

@@ -1,4 +1,4 @@
-"""The start of a run's folder: its `config.yml`, written once checkpoint and data were checked."""
+"""The start of a run's folder: its lock and `config.yml`, written once checkpoint and data were checked."""
 
 from __future__ import annotations
 
@@ -13,18 +13,24 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sadgs_ns.data.checks.capture import check_ahead
-from sadgs_ns.errors import InputError, reason
-from sadgs_ns.files import atomic_path
+from sadgs_ns.errors import InputError, WriteError, reason
+from sadgs_ns.files import atomic_path, check_encoding, lock_folder
 from sadgs_ns.training.options import drop_unknown
 from sadgs_ns.training.run import checkpoints, processes
 from sadgs_ns.training.run.progress import warn
 
+_locks: dict[Path, int] = {}  # The locked folders of this process's runs, and the file descriptors of their locks
+
 
 def begin(config: TrainerConfig) -> None:
-    """Check checkpoint, folder, viewer and data, or raise InputError; then write `config.yml`.
+    """Check checkpoint, folder, viewer and data, or raise InputError; then lock the folder and write `config.yml`.
 
+    The folder stays locked until `release`, or until this process ends, so that no other run writes there.
     A warning names options of a loaded `config.yml` that this version does not have, and the new one leaves them out.
     """
+    for path in (config.get_base_dir(), config.load_dir, config.load_checkpoint):
+        if path is not None:
+            check_encoding(path)
     checkpoints.check_chosen(config.load_dir, config.load_step, config.load_checkpoint)
     _check_folder(config)
     if not processes.is_rank_zero():
@@ -37,6 +43,8 @@ def begin(config: TrainerConfig) -> None:
         _check_address(config.viewer)
     data: Any = config.pipeline.datamanager
     check_ahead(data)
+    _lock(config.get_base_dir())
+    _check_folder(config)  # Another run may have ended there meanwhile.
     CONSOLE.log(f"Saving config to: {write_config(config)}")
 
 
@@ -46,6 +54,29 @@ def write_config(config: TrainerConfig) -> Path:
     with atomic_path(path) as partial:
         partial.write_text(yaml.dump(config), "utf8")
     return path
+
+
+def _lock(folder: Path) -> None:
+    """Make and lock the folder of a run, unless this process has its lock. Raise InputError if another run has it."""
+    path = folder.absolute()
+    if path in _locks:
+        return
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        _locks[path] = lock_folder(
+            path,
+            f"Another run trains in {folder}: wait for it or stop it, or give this one another --timestamp, which is "
+            "the second of its start if none is given.",
+        )
+    except OSError as error:
+        raise WriteError(folder / "config.yml", error) from error
+
+
+def release(folder: Path) -> None:
+    """Release the lock of a run's folder, if this process has it."""
+    lock = _locks.pop(folder.absolute(), None)
+    if lock is not None:
+        os.close(lock)
 
 
 def _check_folder(config: TrainerConfig) -> None:

@@ -26,12 +26,11 @@ from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.kernels_ahead import compile_ahead
 from sadgs_ns.training.kernels_ahead.compilation import compile_kernels
 from sadgs_ns.training.pipeline import SadgsPipeline
-from sadgs_ns.training.run import checkpoints, processes
+from sadgs_ns.training.run import checkpoints, processes, run_folder
 from sadgs_ns.training.run.preparation import prepare_run
 from sadgs_ns.training.run.processes import Peers
 from sadgs_ns.training.run.progress import next_commands, note, remove_tables
 from sadgs_ns.training.run.resume import Resumption
-from sadgs_ns.training.run.run_folder import write_config
 from sadgs_ns.training.run.step_requests import StepRequests
 from sadgs_ns.training.step.cuda_graphs import GraphedSteps
 from sadgs_ns.training.step.optimizers import SadgsOptimizers
@@ -178,6 +177,7 @@ class SadgsTrainer(Trainer):
             self.config.max_num_iterations = total
             self.pipeline.views.close()
             remove_tables()
+            run_folder.release(self.base_dir)
         processes.leave()
 
     def _train_until_interrupted(self, total: int) -> None:
@@ -313,7 +313,7 @@ class SadgsTrainer(Trainer):
         config.load_checkpoint = None
         config.vis = self._requested_vis
         if processes.is_rank_zero():
-            return write_config(config)
+            return run_folder.write_config(config)
         return self.base_dir / "config.yml"
 
     def _stop_if_diverged(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,8 +16,10 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from numpy.typing import NDArray
+from PIL import Image
 from torch import Tensor
 
+from sadgs_ns.data.images import valid_pixels
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.training.run.processes import processes_on_this_machine
 from sadgs_ns.training.step.undistortion import Undistortion
@@ -59,7 +62,13 @@ class LazyImages(Sequence[dict[str, Any]]):
         self._sizes = torch.cat([dataset.cameras.width, dataset.cameras.height], dim=-1).tolist()  # [C][2] px
         self._undistortions = _undistort_cameras(dataset.cameras)
         self._warp_of = lru_cache(_KEPT_WARPS)(Undistortion.warp)
+        outputs = dataset._dataparser_outputs
+        self._masks = outputs.mask_filenames
+        self._mask_color = dataset.mask_color
         self._dataset = copy.copy(dataset)
+        # nerfstudio hides only the pixels of a mask that are 0.
+        self._dataset._dataparser_outputs = dataclasses.replace(outputs, mask_filenames=None)
+        self._dataset.mask_color = None
         self._opencv_agrees: bool | None = None  # None until a JPEG has been decoded
         if dataset.scale_factor == 1 and type(dataset).get_numpy_image is InputDataset.get_numpy_image:
             self._dataset.get_numpy_image = self._decode
@@ -76,12 +85,12 @@ class LazyImages(Sequence[dict[str, Any]]):
         size = tuple(self._sizes[index])
         undistortion = self._undistortions[index]
         try:
-            data = self._dataset.get_data(index, image_type="uint8")
+            data = self._load(index)
         except MemoryError:
             raise
         except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
             broken = name
-            if self._dataset._dataparser_outputs.mask_filenames is not None:
+            if self._masks is not None:
                 broken = f"{name} or its mask"
             raise InputError(
                 f"{broken} cannot be read as an image ({reason(error)}): copy it again, or leave it out of the "
@@ -98,6 +107,27 @@ class LazyImages(Sequence[dict[str, Any]]):
             if mask is not None:
                 data["mask"] = mask.contiguous()
         return {**data, "image": image}
+
+    def _load(self, index: int) -> dict[str, Any]:
+        """Return an image as nerfstudio loads it, and its boolean `mask` [H, W, 1] if the dataset has masks."""
+        data = self._dataset.get_data(index, image_type="uint8")
+        if self._masks is None:
+            return data
+        image: Tensor = data["image"]
+        with Image.open(self._masks[index]) as file:
+            mask = Image.fromarray(valid_pixels(file))
+        if self._dataset.scale_factor != 1:
+            mask = mask.resize((image.shape[1], image.shape[0]), Image.Resampling.NEAREST)
+        valid = torch.from_numpy(np.array(mask))[..., None]
+        if valid.shape[:2] != image.shape[:2]:
+            raise ValueError(
+                f"the mask has {mask.width} × {mask.height} px, the image {image.shape[1]} × {image.shape[0]}"
+            )
+        data["mask"] = valid
+        if self._mask_color:
+            color = torch.ones_like(image) * torch.tensor(self._mask_color)
+            data["image"] = torch.where(valid, image, color)
+        return data
 
     def _decode(self, image_idx: int) -> NDArray[np.uint8]:
         """Decode an image as nerfstudio does, or a JPEG with OpenCV if that gives the same pixels. [H, W, 3 or 4]

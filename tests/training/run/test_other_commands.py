@@ -9,20 +9,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 import types
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from nerfstudio.scripts.eval import ComputePSNR
-from nerfstudio.scripts.render import DatasetRender, RenderInterpolated, SpiralRender
+from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated, SpiralRender
 from nerfstudio.utils import install_checks, writer
+from PIL import Image
 
 from helpers.forked_python import HANGS
 from helpers.kill_and_resume import configure
-from helpers.short_runs import train
+from helpers.short_runs import configure as short_run
+from helpers.short_runs import nerfstudio_data, train
+from helpers.small_scenes import VIEWS
 from sadgs_ns import errors
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.model import SadgsModel
@@ -51,7 +56,19 @@ def no_programs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def said_of(command: Any) -> str | None:
     """What is printed in place of the traceback."""
-    with pytest.raises((ValueError, OSError, AssertionError, AttributeError, RuntimeError, EOFError)) as failed:
+    with pytest.raises(
+        (
+            ArithmeticError,
+            AssertionError,
+            AttributeError,
+            EOFError,
+            LookupError,
+            OSError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        )
+    ) as failed:
         command.main()
     return errors.sentence_of(failed.value)
 
@@ -88,6 +105,140 @@ def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Pa
         assert said == (
             "The run holds out no view that could be rendered: add --split train, which takes the training views."
         )
+
+
+CAMERA = {"camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 1, 0, 0, 0, 1], "fov": 50}
+PATH: dict[str, Any] = {"seconds": 1, "render_height": 36, "render_width": 48, "camera_path": [CAMERA, CAMERA]}
+"""A camera path as the viewer writes it, with whole numbers, as a program may write it."""
+CROP = {"crop_bg_color": {"r": 255, "g": 0, "b": 0}, "crop_center": [0, 0, 0], "crop_scale": [1e-3, 1e-3, 1e-3]}
+
+
+def path_command(config: Path, folder: Path, text: str | bytes | None, **options: Any) -> RenderCameraPath:
+    """`ns-render camera-path` with a file of this content."""
+    file = folder / "path.json"
+    if isinstance(text, str):
+        file.write_text(text)
+    elif text is not None:
+        file.write_bytes(text)
+    images: dict[str, Any] = {"output_format": "images", "image_format": "png"}
+    return RenderCameraPath(config, folder / "views", camera_path_filename=file, **{**images, **options})
+
+
+@pytest.mark.hard_case(
+    "`ns-render camera-path` with a path that is missing, empty, cut off, of another program, not UTF-8, without "
+    "cameras, of 0 seconds or of 0 px",
+    "one sentence",
+)
+@pytest.mark.parametrize("run", [1], indirect=True)
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            None,
+            r"\S+/path\.json cannot be read \(No such file or directory\): give --camera-path-filename the file of ",
+        ),
+        (
+            "",
+            r"The file that --camera-path-filename names is no camera path \(Expecting value: line 1 .*\): give a file",
+        ),
+        (
+            '{"seconds": 1',
+            r"The file that --camera-path-filename names is no camera path \(Expecting .*\): give a file",
+        ),
+        (
+            b"\xff\xfe",
+            r"The file that --camera-path-filename names is no camera path \('utf-8' codec .*\): give a file",
+        ),
+        ("[]", r"The file that --camera-path-filename names is no camera path \(list indices .*\): give a file that"),
+        (
+            "{}",
+            r"The file that --camera-path-filename names is no camera path, because it lacks 'seconds': give a file",
+        ),
+        (json.dumps(PATH | {"camera_path": []}), r"The file that --camera-path-filename names has no cameras: add key"),
+        (
+            json.dumps(PATH | {"camera_path": [{"camera_to_world": [1.0], "fov": 50}]}),
+            r"The file that --camera-path-filename names has a value that cannot be read \(shape .*\): save the path",
+        ),
+        (
+            json.dumps(PATH | {"camera_path": [{"camera_to_world": 16 * [1.0]}]}),
+            r"The file that --camera-path-filename names is no camera path, because it lacks 'fov': give a file that ",
+        ),
+        (
+            json.dumps(PATH | {"crop": {"crop_center": [0, 0, 0]}}),
+            r"The file that --camera-path-filename names is no camera path, because it lacks 'crop_bg_color': give a ",
+        ),
+        (
+            json.dumps(PATH | {"seconds": 0}),
+            r"The camera path lasts 0 seconds: give it a longer duration in the viewer",
+        ),
+        (
+            json.dumps(PATH | {"render_height": 0}),
+            r"Camera 0 has 48 × 0 px: give it, or its path, a larger size\.",
+        ),
+    ],
+)
+def test_a_camera_path_that_cannot_be_drawn_is_one_sentence(
+    text: str | bytes | None, sentence: str, run: tuple[int, Path], tmp_path: Path
+):
+    said = said_of(path_command(run[1], tmp_path, text))
+    assert said is not None and re.match(sentence, said), said
+
+
+@pytest.mark.hard_case("`ns-render` with `rgba`", "PNGs without the background; one sentence for JPEG")
+@pytest.mark.hard_case("a camera path with a crop box and a background colour", "drawn on its colour")
+@pytest.mark.hard_case("`ns-render … --render-nearest-camera`", "one sentence")
+@pytest.mark.parametrize("run", [1], indirect=True)
+def test_opacity_and_the_colour_of_a_crop_are_drawn(run: tuple[int, Path], tmp_path: Path):
+    path_command(run[1], tmp_path, json.dumps(PATH), rendered_output_names=["rgba"]).main()
+    path_command(run[1], tmp_path / "views", json.dumps(PATH)).main()
+    with Image.open(tmp_path / "views" / "00000.png") as image:
+        rgba = np.asarray(image) / 255
+    with Image.open(tmp_path / "views" / "views" / "00000.png") as image:
+        rgb = np.asarray(image) / 255
+    alpha = rgba[..., 3:]
+    assert rgba.shape == (36, 48, 4) and alpha.min() < 1 < 48 * 36 * alpha.mean()
+    assert np.abs(alpha * rgba[..., :3] - rgb).max() < 0.02  # The model's background is black.
+    path_command(run[1], tmp_path, json.dumps(PATH | {"crop": CROP})).main()
+    with Image.open(tmp_path / "views" / "00000.png") as image:
+        assert (np.asarray(image) >= [254, 0, 0]).all() and (np.asarray(image)[..., 1:] <= 1).mean() > 0.9
+    for options in ({"image_format": "jpeg"}, {"rendered_output_names": ["rgb", "rgba"]}):
+        said = said_of(
+            path_command(run[1], tmp_path, json.dumps(PATH), **{"rendered_output_names": ["rgba"], **options})
+        )
+        assert said is not None and said.startswith(
+            "`rgba` fits into PNG alone, and beside no other output: give --ren"
+        )
+    said = said_of(path_command(run[1], tmp_path, json.dumps(PATH), render_nearest_camera=True))
+    assert said is not None and said.startswith(
+        "--render-nearest-camera does not work with methods that train on whole"
+    )
+
+
+@pytest.mark.hard_case("`ns-render dataset` of images `a/000.png` and `b/000.png`", "a file for each, in its folder")
+@pytest.mark.hard_case("`ns-render dataset` of images `000.png` and `000.jpg`", "refused before rendering")
+@pytest.mark.parametrize("names", [("a/000.png", "b/000.png"), ("000.png", "000.jpg")])
+def test_no_rendering_replaces_another(names: tuple[str, str], tmp_path: Path):
+    data = tmp_path / "data"
+    parser: Any = nerfstudio_data(data)
+    parser.eval_mode = "all"
+    described = json.loads((data / "transforms.json").read_text())
+    for frame, name in zip(described["frames"], names, strict=False):
+        (data / "images" / name).parent.mkdir(exist_ok=True)
+        with Image.open(data / frame["file_path"]) as image:
+            image.load()
+        frame["file_path"] = f"images/{name}"
+        image.save(data / frame["file_path"])
+    (data / "transforms.json").write_text(json.dumps(described))
+    file = write_config(train(short_run(tmp_path / "out", parser, iterations=1)).config)
+    command = DatasetRender(load_config=file, output_path=tmp_path / "views", rendered_output_names=["rgb"])
+    if names[0].startswith("a"):
+        command.main()
+        written = [path.relative_to(tmp_path / "views/test/rgb") for path in (tmp_path / "views").rglob("*.jpg")]
+        assert len(written) == VIEWS and {Path("a/000.jpg"), Path("b/000.jpg")} <= {*written}
+    else:
+        with pytest.raises(InputError, match=r"/000\.(jpg|png) and \S+/000\.(jpg|png) differ in their suffix alone"):
+            command.main()
+        assert not (tmp_path / "views").exists()
 
 
 @pytest.mark.hard_case(

@@ -120,6 +120,39 @@ def warp_bilinearly(image: Any, warp: undistortion.Warp) -> Any:
     return cv2.remap(image, warp.x, warp.y, cv2.INTER_LINEAR)
 
 
+@pytest.mark.hard_case(
+    "masks in which black is 16 and white 235, or 16 bits, or with a JPEG's noise", "what is below half is hidden"
+)
+@pytest.mark.parametrize(("mode", "black", "white"), [("L", 16, 235), ("L", 0, 1), ("I;16", 4096, 60160), ("1", 0, 1)])
+@pytest.mark.parametrize("kind", ["perspective", None])
+def test_the_darker_half_of_a_mask_s_values_is_hidden(
+    kind: str | None, mode: str, black: int, white: int, tmp_path: Path
+):
+    if kind is None:
+        parser = nerfstudio_data(tmp_path, masks=True)
+    else:
+        parser = distorted(tmp_path, kind, masks=True)
+    expected = [data["mask"] for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train]
+    for path in tmp_path.glob("images/mask_*"):
+        values = np.where(np.asarray(Image.open(path)) > 0, white, black)
+        if mode == "1":
+            Image.fromarray(values > 0).save(path)
+        else:
+            Image.fromarray(values.astype(np.uint16 if mode == "I;16" else np.uint8)).save(path)
+    found = [data["mask"] for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train]
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
+    assert all(0 < mask.float().mean() < 1 for mask in expected)
+
+
+def test_hidden_pixels_get_the_parser_s_colour(tmp_path: Path):
+    parser = nerfstudio_data(tmp_path, masks=True)
+    parser.mask_color = (1.0, 0.0, 0.0)
+    for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train:
+        hidden = data["image"][~data["mask"][..., 0]]
+        assert (hidden == torch.tensor([1, 0, 0])).all() and len(hidden) > 0
+        assert data["image"][data["mask"][..., 0]].float().std() > 1
+
+
 @pytest.mark.parametrize("options", [{}, {"camera_res_scale_factor": 0.5}], ids=str)
 @pytest.mark.parametrize("tier", TIERS)
 @pytest.mark.parametrize("data", DATA)
