@@ -100,8 +100,8 @@ class SadgsModelConfig(InstantiateConfig):
     0 draws all, as other programs draw the exported file."""
     near_plane: Literal["viewers", "scene"] | float = "viewers"
     """Depth from which Gaussians are drawn, in training and later, in the run's units.
-    "viewers" is 0.01, from which other programs draw the exported file. "scene" is half the depth of a training
-    camera's fifth nearest SfM point, for the camera where this is least; "viewers" is never more than that."""
+    "viewers" is 0.01, from which other programs draw the exported file, but at most the depth of "scene".
+    "scene" is half the depth of a camera's fifth nearest SfM point, for the training camera where this is least."""
     max_angular_scale: float = 0.3
     """Longest standard deviation of a Gaussian as a share of its distance from the nearest training camera.
     A longer one that lies beside a view can cover it with haze; 0 sets no limit."""

@@ -179,6 +179,7 @@ def test_two_processes_train_with_the_same_gains_as_one(exposed: Path, tmp_path:
     def configured(name: str) -> SadgsTrainerConfig:
         config = few_steps(exposed, tmp_path / name, views=2)
         config.pipeline.model.bounding_box_points = False
+        config.pipeline.model.exposure = "auto"
         return config
 
     torch.manual_seed(0)
@@ -212,6 +213,7 @@ def with_exif(folder: Path, name: str) -> NerfstudioDataParserConfig:
 def test_exif_serves_without_points(tmp_path: Path, monkeypatch: Any):
     monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))
     config = configure(tmp_path / "out", with_exif(tmp_path / "data", "exif"), 2)
+    config.pipeline.model.exposure = "auto"
     pipeline = set_up(config).pipeline
     table = pipeline.model.exposure
     assert table is not None and len(table.points) == 0

@@ -191,7 +191,7 @@ def test_cameras_that_see_nothing_are_refused(config: SadgsTrainerConfig):
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e12)
     with pytest.raises(
-        InputError, match=r"^The renderings would be empty, since a camera sees from \d.*e\+11 to 1e\+10 units"
+        InputError, match=r"^The renderings would be empty, since a camera sees from 0\.01 to 1e\+10 units"
     ):
         set_up(config)
 
