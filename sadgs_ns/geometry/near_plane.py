@@ -1,8 +1,8 @@
 """The near plane of a scene: how near anything comes to the cameras.
 
 A faint Gaussian just before a camera covers the whole image with haze. Training fades those before the training
-cameras, but not those before a view between them. The photos show nothing that near: `camera_paths` takes its reach from
-this depth. The paper's presets draw nothing nearer, as all runs of version 1.0.0 did.
+cameras, but not those before a view between them. The photos show nothing that near: `camera_paths` takes its reach
+from this depth. The paper's presets draw nothing nearer, as all runs of version 1.0.0 did.
 """
 
 from __future__ import annotations
