@@ -81,7 +81,8 @@ def test_coefficients_beyond_32_bits_are_found_forward_and_backward():
     v_colors = torch.tensor([[[10.0, 20, 30], [40, 50, 60], [70, 80, 90]]], device=DEVICE)
     v_means, v_first = torch.empty_like(means), torch.empty_like(first)
     harmonics._backward[1,](
-        means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, n, 0, 1, 3, stride, 3, 1, 32, 2
+        means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_means,
+        n, 0, 1, 3, stride, 3, False, 1, 32, 2,
     )  # fmt: skip
     for g in range(n):
         expected = (0.48860251190292 * v_colors[0, g]).byte()

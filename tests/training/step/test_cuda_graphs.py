@@ -133,6 +133,7 @@ def choose_colors(config: SadgsTrainerConfig, colors: str, monkeypatch: pytest.M
     if colors == "affine":
         config.pipeline.model.color_model = "affine"
     if colors == "gains":
+        config.pipeline.model.exposure = "auto"
         monkeypatch.setattr(exposure_start, "LEAST_DEVIATION", 0.0)
         monkeypatch.setattr(exposure_start, "LEAST_REDUCTION", -1.0)
 
