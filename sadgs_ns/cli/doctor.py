@@ -33,7 +33,7 @@ _NEEDED = (  # A program or library, its names, what needs it, and the remedy
     ("C compiler", "gcc clang", "Triton compiles with it; install the packages gcc and python3-dev"),
     ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, `ns-process-data` too; install the package ffmpeg"),
     ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
-    ("Node.js", "npx", "pages (.html) are written with its npx; install version 22 or newer from nodejs.org"),
+    ("Node.js", "npm", "pages (.html) are written by a program for it; install version 22 or newer from nodejs.org"),
 )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats import FORMATS, MESH
+from sadgs_ns.formats import FORMATS, MESH, page_writer
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.options import check_size
@@ -55,15 +55,18 @@ class Sadgs:
 def choose_formats(requested: str | None, measure: bool, console: Console) -> list[str]:
     """Return the formats to export, with the page as the last one.
 
-    Without a request they are a page and a PLY, or the PLY alone if there is no Node.js, which the console then says.
-    A PLY is among them if the file shall be measured. Raise InputError for an unknown format, a page without Node.js,
-    or a mesh without open3d.
+    Without a request they are a page and a PLY, or the PLY alone if there is nothing that writes a page, which the
+    console then says. A PLY is among them if the file shall be measured. Raise InputError for an unknown format, a page
+    without Node.js, or a mesh without open3d.
     """
-    has_node = shutil.which("npx") is not None
+    has_node = page_writer.has_node()
     if requested is None:
-        if has_node:
+        if not has_node:
+            console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
+            return ["ply"]
+        if page_writer.is_installed() or _may_download(console):
             return ["ply", "html"]
-        console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
+        console.print("No page is made, since what writes it was not downloaded: --formats html,ply does that once.")
         return ["ply"]
     formats = list(dict.fromkeys(requested.split(",")))
     unknown = [name for name in formats if name not in FORMAT_NAMES]
@@ -76,6 +79,14 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     if measure and "ply" not in formats:
         formats.append("ply")
     return sorted(formats, key=lambda name: name == "html")
+
+
+def _may_download(console: Console) -> bool:
+    """Ask whether what writes pages may be downloaded; without a terminal nobody can allow it."""
+    if not (sys.stdin.isatty() and console.is_terminal):
+        return False
+    answer = console.input(f"The page is written by {page_writer.DOWNLOAD}. Download it now? [Y/n] ")
+    return answer.strip().lower() in ("", "y", "yes")
 
 
 def check_options(options: Sadgs, train_options: Sequence[str]) -> None:

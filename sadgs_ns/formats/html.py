@@ -1,7 +1,7 @@
 """One HTML file that opens without a network: PlayCanvas's SuperSplat viewer, with the Gaussians as SOG inside.
 
-`@playcanvas/splat-transform`, a program for Node.js, makes the page of a single Gaussian, with a network the first
-time. The page's content is then replaced, because SOG is written here in a fraction of that program's time.
+A program for Node.js makes the page of a single Gaussian (`page_writer`). The page's content is then replaced, because
+SOG is written here in a fraction of that program's time.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ import io
 import json
 import math
 import re
-import shutil
-import subprocess
 import tempfile
 from pathlib import Path
 from typing import IO, Any
@@ -21,12 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sadgs_ns.data.coordinates import Similarity
-from sadgs_ns.errors import InputError, reason
-from sadgs_ns.formats import ply, sog
+from sadgs_ns.errors import InputError
+from sadgs_ns.formats import page_writer, ply, sog
 from sadgs_ns.formats.gaussians import DEFAULTS, Context, Gaussians, Start
 
-VIEWER = "@playcanvas/splat-transform@3.7.0"
-_SECONDS = 300  # Longest time for making the page, with the download
 _BOOTSTRAP = re.compile(rb'(<script type="application/json" id="sse-bootstrap">)(.*?)(</script>)', re.DOTALL)
 """The page's settings and content."""
 _TO_VIEWER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # From z up to the viewer's frame, in which y is up
@@ -54,7 +50,8 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
 
     page, number = _BOOTSTRAP.subn(fill, page)
     if number != 1:
-        raise InputError(f"{VIEWER} made a page of another kind than this version knows: choose another format.")
+        problem = "PlayCanvas's splat-transform made a page of another kind than this version knows"
+        raise InputError(f"{problem}: choose another format.")
     file.write(page)
 
 
@@ -84,23 +81,13 @@ def _settings(start: Start) -> dict[str, Any]:
 
 def _page() -> bytes:
     """Return the page of a single Gaussian."""
-    remedy = "install Node.js 22 or newer, be online the first time, or choose another format"
-    npx = shutil.which("npx")
-    if npx is None:
-        raise InputError(f"HTML is written with the help of Node.js, whose npx is not there: {remedy}.")
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "point.ply"
-        page = path.with_suffix(".html")
-        with path.open("wb") as file:
+        points = Path(folder) / "point.ply"
+        page = points.with_suffix(".html")
+        with points.open("wb") as file:
             ply.write(file, _single_gaussian(), DEFAULTS)
-        command = [npx, "--yes", VIEWER, "--quiet", "--gpu", "cpu", str(path), str(page)]
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=folder)
-            return page.read_bytes()
-        except subprocess.TimeoutExpired as error:
-            raise InputError(f"`npx {VIEWER}` took more than {_SECONDS} s: {remedy}.") from error
-        except (subprocess.CalledProcessError, OSError) as error:
-            raise InputError(f"`npx {VIEWER}` failed ({_cause(error)}): {remedy}.") from error
+        page_writer.write_page(points, page)
+        return page.read_bytes()
 
 
 def _single_gaussian() -> Gaussians:
@@ -113,15 +100,6 @@ def _single_gaussian() -> Gaussians:
         features_dc=zeros,
         features_rest=np.zeros((1, 0, 3), np.float32),
     )
-
-
-def _cause(error: Exception) -> str:
-    """Return why a program failed: the last line that it printed, or else the reason of the error."""
-    if isinstance(error, subprocess.CalledProcessError):
-        lines = error.stderr.strip().splitlines()
-        if lines:
-            return lines[-1]
-    return reason(error)
 
 
 def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, means: NDArray[np.float32]) -> Start:

@@ -30,6 +30,7 @@ from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
 from sadgs_ns.errors import RunError
 from sadgs_ns.files import locked
+from sadgs_ns.formats import page_writer
 from sadgs_ns.placing.plan import Summary
 from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.stamps import photo_stamps
@@ -76,12 +77,19 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
     return stop_at
 
 
-def make_a_page_without_network(npx: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Put a program in the place of Node.js's that makes a page without a viewer."""
+def make_a_page_without_network(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put programs in the place of Node.js and npm that make a page without a viewer."""
     page = '<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
-    npx.write_text(f"#!/bin/sh\nfor file; do :; done\necho '{page}' > \"$file\"\n")
-    npx.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{npx.parent}:{os.environ['PATH']}")
+    programs = {
+        "node": f"for file; do :; done\necho '{page}' > \"$file\"\n",
+        "npm": f"mkdir -p {page_writer.PROGRAM.parent}\ntouch {page_writer.PROGRAM}\n",
+    }
+    folder.mkdir()
+    for name, script in programs.items():
+        (folder / name).write_text(f"#!/bin/sh\n{script}")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
 
 
 def lines_of(printed: str) -> dict[str, str]:
@@ -132,7 +140,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
 ):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    make_a_page_without_network(tmp_path / "npx", monkeypatch)
+    make_a_page_without_network(tmp_path / "node.js", monkeypatch)
     command = [str(photos), "--formats", "ply,html", "--max-size", "120", *TRAINING]
     folder = tmp_path / "my room-splat"
 
@@ -543,7 +551,7 @@ def test_the_process_that_exports_starts_while_training_runs(
         return object()
 
     monkeypatch.setattr(PhotosToSplat, "worker", worker)
-    make_a_page_without_network(tmp_path / "npx", monkeypatch)
+    make_a_page_without_network(tmp_path / "node.js", monkeypatch)
     assert main([str(scene), "-o", str(tmp_path / "out"), "--formats", "html,ply"]) == 0
     assert started == [("training", []), ("export", ["ns-train"])], "one process makes both files"
     assert [words[0] for words in commands] == ["ns-train", "sadgs-export", "sadgs-export"]

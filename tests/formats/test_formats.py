@@ -30,7 +30,7 @@ from helpers.random_gaussians import random_gaussians
 from sadgs_ns import formats
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
-from sadgs_ns.formats import glb, html, packing, ply, sog
+from sadgs_ns.formats import glb, html, packing, page_writer, ply, sog
 from sadgs_ns.formats.gaussians import Context, Gaussians, Start, of_parameters
 
 START = Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
@@ -229,7 +229,7 @@ def test_an_spz_says_that_its_axes_are_those_of_a_ply(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("npx") is None, reason="needs Node.js")
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
-@pytest.mark.parametrize("program", ["@playcanvas/splat-transform@2.7.1", html.VIEWER])
+@pytest.mark.parametrize("program", ["@playcanvas/splat-transform@2.7.1", "@playcanvas/splat-transform@3.7.0"])
 def test_splat_transform_finds_the_same_gaussians_in_every_format(program: str, suffix: str, tmp_path: Path):
     written, path = random_gaussians(300), tmp_path / f"splat{suffix}"
     formats.write(path, written)
@@ -337,21 +337,27 @@ def _raise(error: Exception) -> Callable[..., Any]:
 @pytest.mark.hard_case(
     "a page without Node.js, without a network, or of another release of the viewer", "refused: what to install"
 )
-def test_what_goes_wrong_with_node_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_what_goes_wrong_with_node_is_one_sentence(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+):
+    cache = tmp_path_factory.mktemp("cache")
+
     def fails(message: str) -> None:
         with pytest.raises(InputError, match=message):
             formats.write(tmp_path / "splat.html", random_gaussians(5), Context(start=START))
         assert list(tmp_path.iterdir()) == []
 
     remedy = r": install Node\.js 22 or newer, be online the first time, or choose another format\.$"
-    monkeypatch.setattr(html.shutil, "which", lambda _: None)
-    fails(r"^HTML is written with the help of Node\.js, whose npx is not there" + remedy)
-    monkeypatch.setattr(html.shutil, "which", lambda _: "npx")
-    failed = subprocess.CalledProcessError(1, "npx", stderr="npm warn\nnpm error network\n")
-    monkeypatch.setattr(html.subprocess, "run", _raise(failed))
-    fails(r"^`npx @playcanvas/splat-transform@\S+` failed \(npm error network\)" + remedy)
-    monkeypatch.setattr(html.subprocess, "run", _raise(subprocess.TimeoutExpired("npx", 300)))
-    fails(r"^`npx @playcanvas/splat-transform@\S+` took more than 300 s" + remedy)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    monkeypatch.setattr(page_writer.shutil, "which", lambda _: None)
+    fails(r"^HTML is written with the help of Node\.js, whose node and npm are not there" + remedy)
+    monkeypatch.setattr(page_writer.shutil, "which", lambda name: name)
+    failed = subprocess.CalledProcessError(1, "npm", stderr="npm warn\nnpm error network\n")
+    monkeypatch.setattr(page_writer.subprocess, "run", _raise(failed))
+    fails(r"^`npm ci` failed \(npm error network\)" + remedy)
+    monkeypatch.setattr(page_writer.subprocess, "run", _raise(subprocess.TimeoutExpired("npm", 300)))
+    fails(r"^`npm ci` took more than 300 s" + remedy)
+    assert list((cache / "sadgs_ns").iterdir()) == [], "nothing is left of what failed"
     monkeypatch.setattr(html, "_page", lambda: b"<p>another page</p>")
     fails(r"made a page of another kind than this version knows: choose another format\.$")
 
