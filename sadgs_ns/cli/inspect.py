@@ -18,7 +18,7 @@ from sadgs_ns.cli.program import parse
 class Inspect:
     """Pictures of a view of a run: the photo's structure tensor as ellipses and local wavelength, η of the Gaussians,
     how many children they would get, which are low, and one densification step, conventional against structure-aware,
-    in random colours. A config.yml is a program, which this runs: give only those you trust."""
+    in random colours. A config.yml that names other code than nerfstudio's and ours is refused."""
 
     config: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CONFIG")]
     """config.yml of a finished or running run of sadgs, or its folder."""

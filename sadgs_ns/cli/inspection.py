@@ -24,6 +24,7 @@ from sadgs_ns.method.split import grid_split, num_children
 from sadgs_ns.render.blending import blend
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.config_file import ConfigLoader
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints
@@ -87,11 +88,11 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
 
 
 def _read_config(path: Path) -> SadgsTrainerConfig:
-    """Read a run's config.yml, or raise InputError. PyYAML's full loader calls what the file names."""
+    """Read a run's config.yml, or raise InputError, also if it names other code than nerfstudio's and ours."""
     if not path.is_file():
         raise InputError(f"{path} does not exist: give the config.yml of a run, outputs/…/sadgs/…/config.yml.")
     try:
-        config = yaml.load(path.read_text("utf8"), Loader=yaml.Loader)
+        config = yaml.load(path.read_text("utf8"), Loader=ConfigLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         problem = " ".join(str(error).split())
         raise InputError(f"{path} cannot be read as a run's config.yml ({problem}): give one of sadgs.") from error
