@@ -74,6 +74,7 @@ class SadgsPipeline(VanillaPipeline):
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
         if self.model.poses is not None and isinstance(self.datamanager.config.dataparser, BlenderDataParserConfig):
+        self._warn_of_missing_masks()
             note("The poses stay as they are: those of Blender data are exact.")
             self.model.poses = None
         self.model.set_cameras(self.datamanager.train_dataset.cameras)
@@ -122,6 +123,12 @@ class SadgsPipeline(VanillaPipeline):
 
     def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
         """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
+
+    def _warn_of_missing_masks(self) -> None:
+        """Print a warning if an option names a colour for what masks hide, and the capture has no masks."""
+        color = getattr(self.datamanager.dataparser.config, "mask_color", None)
+        if color and self.datamanager.train_dataparser_outputs.mask_filenames is None:
+            warn("--mask-color does nothing, because the capture has no masks: leave it out, or name them.")
 
         It loads the images' cameras, so call it after `near_plane_of_scene`. Raises as `PointObservations`.
         """
