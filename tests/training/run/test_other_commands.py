@@ -128,7 +128,7 @@ def path_command(config: Path, folder: Path, text: str | bytes | None, **options
 
 @pytest.mark.hard_case(
     "`ns-render camera-path` with a path that is missing, empty, cut off, of another program, not UTF-8, without "
-    "cameras, of 0 seconds or of 0 px",
+    "cameras, of 0 seconds or of 0 px, of a fisheye or 360°",
     "one sentence",
 )
 @pytest.mark.parametrize("run", [1], indirect=True)
@@ -172,6 +172,13 @@ def path_command(config: Path, folder: Path, text: str | bytes | None, **options
         (
             json.dumps(PATH | {"seconds": 0}),
             r"The camera path lasts 0 seconds: give it a longer duration in the viewer",
+        ),
+        *(
+            (
+                json.dumps(PATH | {"camera_type": kind}),
+                r"Camera 0 of the path is \w+, which sadgs cannot draw: choose the camera type Perspective in",
+            )
+            for kind in ("fisheye", "equirectangular")
         ),
         (
             json.dumps(PATH | {"render_height": 0}),
@@ -282,13 +289,6 @@ def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp
 
 
 @pytest.mark.hard_case(
-    "`ns-eval`, `ns-render` or `ns-viewer` of a run whose latest checkpoint is cut off", "one sentence"
-)
-@pytest.mark.parametrize("size", [0, 5000, 20_000])
-def test_a_damaged_checkpoint_is_named(size: int, run: tuple[int, Path]):
-    (checkpoint,) = run[1].parent.glob("nerfstudio_models/*.ckpt")
-    damaged = checkpoint.with_name("step-000000009.ckpt")
-@pytest.mark.hard_case(
     "`ns-eval` or `ns-viewer` of a run whose capture is not where its `config.yml` says, as from another folder",
     "one sentence: change to the folder of training, or correct the path",
 )
@@ -313,6 +313,13 @@ def test_a_run_from_another_folder_says_where_its_capture_was(
         assert said_of(command) == f"{Path(folder).absolute()}, on which the run was trained, is not there: {remedy}"
 
 
+@pytest.mark.hard_case(
+    "`ns-eval`, `ns-render` or `ns-viewer` of a run whose latest checkpoint is cut off", "one sentence"
+)
+@pytest.mark.parametrize("size", [0, 5000, 20_000])
+def test_a_damaged_checkpoint_is_named(size: int, run: tuple[int, Path]):
+    (checkpoint,) = run[1].parent.glob("nerfstudio_models/*.ckpt")
+    damaged = checkpoint.with_name("step-000000009.ckpt")
     damaged.write_bytes(checkpoint.read_bytes()[:size])
     said = said_of(ComputePSNR(run[1]))
     damaged.unlink()
