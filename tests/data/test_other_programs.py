@@ -8,6 +8,7 @@ import math
 import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from helpers import forked_python
 from helpers.short_runs import blender_data, nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
@@ -275,7 +277,7 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
     from nerfstudio.scripts import process_data
 
     data = tmp_path / "my export"
-    for path in (data / file, data / photos / "1.jpg"):
+    for path in (data / file, data / photos / "1.jpg", data / "keyframes/depth/1.png"):
         path.parent.mkdir(parents=True, exist_ok=True)
     (data / file).write_text(content)
     Image.new("RGB", (8, 8)).save(data / photos / "1.jpg")
@@ -316,6 +318,51 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
 )
 def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
     file: str, content: str, command: str, captures: Path, tmp_path: Path
+@pytest.mark.hard_case(
+    "a capture of Polycam without LiDAR", "the command makes the folder of depth that `ns-process-data` asks for"
+)
+def test_a_capture_of_polycam_without_depth_is_converted_with_its_poses(tmp_path: Path):
+    """In a process of its own, nerfstudio's script needs neither Open3D nor FFmpeg, which a machine may lack."""
+    data = tmp_path / "my capture"
+    pose = {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
+    camera = {"fx": 90.0, "fy": 90.0, "cx": 50.0, "cy": 40.0, "width": 100, "height": 80, "blur_score": 99.0}
+    for name in ("keyframes/images/1.jpg", "keyframes/cameras/1.json"):
+        (data / name).parent.mkdir(parents=True)
+    Image.new("RGB", (100, 80)).save(data / "keyframes/images/1.jpg")
+    (data / "keyframes/cameras/1.json").write_text(json.dumps(pose | camera))
+    (said,) = errors(data)
+    converting = f"ns-process-data polycam --data '{data}' --output-dir FOLDER"
+    making = f"mkdir '{data}'/keyframes/depth"
+    assert said == f"{data}/keyframes/cameras/1.json has poses: `{making} && {converting}` keeps them."
+    code = f"""
+import sys
+from pathlib import Path
+from unittest.mock import MagicMock
+sys.modules["open3d"] = MagicMock()
+from nerfstudio.process_data import process_data_utils
+from nerfstudio.scripts.process_data import ProcessPolycam
+process_data_utils.copy_images_list = lambda images, image_dir, **others: [image_dir / image.name for image in images]
+ProcessPolycam(data=Path({str(data)!r}), output_dir=Path({str(tmp_path / "out")!r})).main()
+"""
+    assert "Depth map directory" in forked_python.python(code).stderr
+    subprocess.run(making, shell=True, check=True)
+    assert forked_python.python(code).returncode == 0
+    (frame,) = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    assert frame["fl_x"] == 90
+    assert errors(data) == [f"{data}/keyframes/cameras/1.json has poses: `{converting}` keeps them."]
+
+
+@pytest.mark.hard_case("poses of LLFF (`poses_bounds.npy`) or in a `capture.json`", "the file is named: it is not read")
+@pytest.mark.parametrize("name", ["poses_bounds.npy", "capture.json"])
+def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path, tmp_path: Path):
+    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    (tmp_path / name).touch()
+    computing = f"`sadgs-process {tmp_path}/images FOLDER` computes others"
+    problem = f"{tmp_path / name} may have poses, but in a format that is not read"
+    said = f"{problem}: write them to a transforms.json to keep them; {computing}."
+    assert errors(tmp_path) == [said] == [poses_elsewhere(tmp_path)]
+
+
 ):
     shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
     (tmp_path / file).write_text("")

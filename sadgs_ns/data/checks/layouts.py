@@ -14,13 +14,14 @@ _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
     "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse"
 )
+_POLYCAM = "keyframes/cameras/*.json"
 _EXPORTS = {
     "*.xml": (b"<chunk", "ns-process-data metashape --data {photos} --xml {file} --output-dir FOLDER"),
     "*.psx": (b"", "ns-process-data metashape --data {photos} --xml EXPORTED.xml --output-dir FOLDER"),
     "*.csv": (b"#name,", "ns-process-data realitycapture --data {photos} --csv {file} --output-dir FOLDER"),
     "*.xmp": (b"xcr:Rotation", "ns-process-data realitycapture --data {photos} --csv EXPORTED.csv --output-dir FOLDER"),
     "odm_report/shots.geojson": (b"", "ns-process-data odm --data {data} --output-dir FOLDER"),
-    "keyframes/cameras/*.json": (b"", "ns-process-data polycam --data {data} --output-dir FOLDER"),
+    _POLYCAM: (b"", "ns-process-data polycam --data {data} --output-dir FOLDER"),
     "metadata.json": (b'"poses"', "ns-process-data record3d --data {data} --output-dir FOLDER"),
     "reconstruction.json": (b'"shots"', "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse"),
     "*sfm*": (b'"poses"', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
@@ -38,6 +39,9 @@ def poses_elsewhere(data: Path) -> str | None:
                 quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
                 return f"{file} has poses: `{command.format(**quoted)}` keeps them."
     return None
+                if pattern == _POLYCAM and not (data / "keyframes" / "depth").exists():
+                    # Captures without LiDAR lack the folder, which the command asks for and does not read.
+                    command = f"mkdir {{data}}/keyframes/depth && {command}"
 
 
 def _folder_of_photos(data: Path) -> Path:
