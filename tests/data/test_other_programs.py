@@ -229,6 +229,30 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
 
 
 @pytest.mark.hard_case(
+    "a Blender scene whose files have focal lengths instead of angles of view",
+    "refused once: renamed to transforms.json, it trains",
+)
+@pytest.mark.parametrize("in_frames", [False, True])
+def test_focal_lengths_in_a_blender_scene_are_refused_before_missing_angles(
+    in_frames: bool, write: Callable[..., Path]
+):
+    def of_file(meta: dict[str, Any]) -> None:
+        del meta["camera_angle_x"]
+        if not in_frames:
+            meta["fl_x"] = FOCAL
+
+    def of_frame(frame: dict[str, Any]) -> None:
+        if in_frames:
+            frame["fl_x"] = FOCAL
+
+    data = write(of_file, of_frame, kind="blender")
+    (said,) = errors(data)
+    assert said == f"{data}/transforms_train.json: of Blender scenes fl_x is not read; rename it to transforms.json."
+    (data / "transforms_train.json").rename(data / "transforms.json")
+    assert errors(data) == []
+
+
+@pytest.mark.hard_case(
     "an image that is there with another suffix, in other case, or in another folder than a `transforms.json` (also of "
     "Windows) or a Blender scene says",
     "refused: the sentence names the file that is there",
@@ -295,30 +319,6 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
 
 
 @pytest.mark.hard_case(
-    "poses of OpenSfM, Meshroom or Bundler",
-    "the command that makes a COLMAP model of them is named, which is then read",
-)
-@pytest.mark.parametrize(
-    ("file", "content", "command"),
-    [
-        (
-            "reconstruction.json",
-            '[{"shots": {}}]',
-            "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse",
-        ),
-        ("cameras.sfm", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
-        ("sfm.json", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
-        (
-            "bundle.out",
-            "# Bundle file v0.3\n",
-            "kapture_import_bundler.py -i {file} -l LIST.txt -im {data}/images --add-reconstruction -o KAPTURE && "
-            "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse",
-        ),
-    ],
-)
-def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
-    file: str, content: str, command: str, captures: Path, tmp_path: Path
-@pytest.mark.hard_case(
     "a capture of Polycam without LiDAR", "the command makes the folder of depth that `ns-process-data` asks for"
 )
 def test_a_capture_of_polycam_without_depth_is_converted_with_its_poses(tmp_path: Path):
@@ -363,6 +363,30 @@ def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path,
     assert errors(tmp_path) == [said] == [poses_elsewhere(tmp_path)]
 
 
+@pytest.mark.hard_case(
+    "poses of OpenSfM, Meshroom or Bundler",
+    "the command that makes a COLMAP model of them is named, which is then read",
+)
+@pytest.mark.parametrize(
+    ("file", "content", "command"),
+    [
+        (
+            "reconstruction.json",
+            '[{"shots": {}}]',
+            "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse",
+        ),
+        ("cameras.sfm", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
+        ("sfm.json", '{"poses": []}', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
+        (
+            "bundle.out",
+            "# Bundle file v0.3\n",
+            "kapture_import_bundler.py -i {file} -l LIST.txt -im {data}/images --add-reconstruction -o KAPTURE && "
+            "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse",
+        ),
+    ],
+)
+def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
+    file: str, content: str, command: str, captures: Path, tmp_path: Path
 ):
     shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
     (tmp_path / file).write_text("")

@@ -28,10 +28,12 @@ _EXPORTS = {
     "bundle.out": (b"# Bundle", _BUNDLER),
 }
 """Files with other programs' poses, a part of their content, and the command that reads them."""
+_UNREAD = ("poses_bounds.npy", "capture.json")
+"""Files with poses that no command reads: those of LLFF, and those of some apps for phones."""
 
 
 def poses_elsewhere(data: Path) -> str | None:
-    """Return the sentence for a folder with another program's poses, which a command reads, or None."""
+    """Return the sentence for a folder with another program's poses, which a command reads or none does, or None."""
     for pattern, (mark, command) in _EXPORTS.items():
         for file in sorted(data.glob(pattern)):
             if file.is_file() and mark in file.read_bytes():
@@ -40,6 +42,14 @@ def poses_elsewhere(data: Path) -> str | None:
                 return f"{file} has poses: `{command.format(**quoted)}` keeps them."
     return None
                 if pattern == _POLYCAM and not (data / "keyframes" / "depth").exists():
+                return f"{file} has poses: `{command.format(**quoted)}` keeps them."
+    for name in _UNREAD:
+        file = data / name
+        if file.is_file():
+            compute = f"sadgs-process {shlex.quote(str(_folder_of_photos(data)))} FOLDER"
+            problem = f"{file} may have poses, but in a format that is not read"
+            return f"{problem}: write them to a transforms.json to keep them; `{compute}` computes others."
+    return None
                     # Captures without LiDAR lack the folder, which the command asks for and does not read.
                     command = f"mkdir {{data}}/keyframes/depth && {command}"
 
