@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.images import images_in
+from sadgs_ns.data.images import VIDEO_SUFFIXES, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
 from sadgs_ns.data.transforms import GIVE_POSES
 
@@ -39,9 +39,9 @@ def poses_elsewhere(data: Path) -> str | None:
             if file.is_file() and mark in file.read_bytes():
                 paths = {"file": file, "photos": _folder_of_photos(data), "data": data}
                 quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
-                return f"{file} has poses: `{command.format(**quoted)}` keeps them."
-    return None
                 if pattern == _POLYCAM and not (data / "keyframes" / "depth").exists():
+                    # Captures without LiDAR lack the folder, which the command asks for and does not read.
+                    command = f"mkdir {{data}}/keyframes/depth && {command}"
                 return f"{file} has poses: `{command.format(**quoted)}` keeps them."
     for name in _UNREAD:
         file = data / name
@@ -50,8 +50,6 @@ def poses_elsewhere(data: Path) -> str | None:
             problem = f"{file} may have poses, but in a format that is not read"
             return f"{problem}: write them to a transforms.json to keep them; `{compute}` computes others."
     return None
-                    # Captures without LiDAR lack the folder, which the command asks for and does not read.
-                    command = f"mkdir {{data}}/keyframes/depth && {command}"
 
 
 def _folder_of_photos(data: Path) -> Path:
@@ -71,10 +69,8 @@ def no_layout(data: Path) -> str:
         run = shlex.quote(str(config))
         shown = f"`ns-viewer --load-config {run}` shows it"
         return f"{data} is a run and no capture: {shown}, and `sadgs-export {run} --output splat.ply` exports it."
-    if not data.exists():
-        return f"{data} does not exist: give --data the folder of a capture."
     if not data.is_dir():
-        return f"{data} is a file: give --data the folder of a capture."
+        return _no_folder(data)
     models = find_reconstructions(data)
     if models:
         model = data / next(iter(models))
@@ -105,6 +101,16 @@ def no_layout(data: Path) -> str:
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _no_folder(data: Path) -> str:
+    """Return the sentence for a path that is no folder."""
+    if not data.exists():
+        return f"{data} does not exist: give --data the folder of a capture."
+    if data.suffix.lower() in VIDEO_SUFFIXES:
+        command = f"sadgs-process {shlex.quote(str(data))} FOLDER"
+        return f"{data} is a video and no capture: `{command}` makes one of it, and `sadgs` a splat."
+    return f"{data} is a file: give --data the folder of a capture."
 
 
 def _capture_around(folder: Path) -> Path | None:
