@@ -301,6 +301,32 @@ def test_the_summary_has_the_reasons_that_speak_against_a_model(run: Run, photos
     assert summary.doubts[0].startswith("their focal lengths across and down would differ by a factor of 1.4: ")
 
 
+@pytest.mark.hard_case("photos of two scenes in one folder", "those of the smaller one are said to share nothing")
+def test_photos_of_another_scene_share_nothing_with_those_that_registered(
+    run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reconstruct, "FEW_FEATURES", 1)
+    model = pycolmap.Reconstruction(run.out / "work" / "model")
+    names = sorted(photo.name for photo in photos.iterdir())
+    placed, alone, other = names[:3]
+    for image in list(model.images.values()):
+        if image.name != placed:
+            model.deregister_frame(image.frame_id)
+    database = Path(shutil.copy(run.out / "work" / "database.db", tmp_path))
+    with pycolmap.Database.open(database) as opened:
+        identities = {image.name: image.image_id for image in opened.read_all_images()}
+        opened.clear_two_view_geometries()
+        for one, two in ((placed, other), (alone, names[3])):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = np.stack([np.arange(40, dtype=np.uint32)] * 2, axis=1)
+            opened.write_two_view_geometry(identities[one], identities[two], geometry)
+    left_out = reconstruct.summarize(names[:4], model, database, "exhaustive", "").left_out
+    assert left_out[other] == "matches other photos, but its pose stayed ambiguous"
+    share_nothing = "matches none of the registered photos, only others that are left out: another scene?"
+    assert left_out[alone] == left_out[names[3]] == share_nothing
+
+
 # nerfstudio opens the first photo to learn its size and does not close it.
 OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
 
