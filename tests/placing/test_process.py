@@ -48,7 +48,7 @@ from sadgs_ns.placing import features, place, reconstruct
 from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_masks
-from sadgs_ns.placing.folder import find_source, look_into
+from sadgs_ns.placing.folder import find_source, find_videos, look_into
 from sadgs_ns.placing.options import PlacingOptions
 from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
 from sadgs_ns.placing.place import Placed, place_photos
@@ -436,6 +436,31 @@ def test_an_archive_of_photos_is_no_video(kind: str, tmp_path: Path, capsys):
     assert main([str(archive.parent), str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case(
+    "`.insp`, `.insv` and `.360`, as 360° cameras store photos and videos", "left out with a count, or refused: stitch"
+)
+@pytest.mark.parametrize("suffix", [".insp", ".INSV", ".360"])
+def test_files_of_360_degree_cameras_must_be_stitched(suffix: str, tmp_path: Path, capsys):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i in range(3):
+        Image.new("RGB", (64, 32)).save(folder / f"{i}{suffix}", "JPEG")
+    assert main([str(folder), str(tmp_path / "out")]) == 2
+    stitch = "(stitch them to panoramas or films of 2:1 with the camera's program): 3, such as 0"
+    sentence = f"better 30 or more. Left out as files of 360° cameras {stitch}{suffix}.\n"
+    assert sentence in capsys.readouterr().err
+    assert main([str(folder / f"0{suffix}"), str(tmp_path / "out")]) == 2
+    assert "stitch it to a panorama or film of 2:1 with the camera's program." in capsys.readouterr().err
+
+
+@pytest.mark.hard_case("videos of camcorders (`.mts`, `.mxf`, `.mpeg`) in a folder", "read as others")
+def test_videos_of_camcorders_are_videos(tmp_path: Path):
+    names = ["a.MTS", "b.mxf", "c.mpeg"]
+    for name in names:
+        (tmp_path / name).touch()
+    assert find_videos(tmp_path) == names
 
 
 @pytest.mark.hard_case("a single photo, or a text, instead of photos", "refused")
