@@ -31,7 +31,7 @@ _DRIVER_FILE = Path("/proc/driver/nvidia/version")  # NVIDIA's driver writes it,
 _NEEDED = (  # A program or library, its names, what needs it, and the remedy
     ("nvcc", "nvcc", "only the backend gsplat needs it, to compile; install the toolkit of torch's CUDA"),
     ("C compiler", "gcc clang", "Triton compiles with it; install the packages gcc and python3-dev"),
-    ("ffmpeg", "ffmpeg", "`ns-render` needs it for videos, `ns-process-data` too; install the package ffmpeg"),
+    ("ffmpeg", "ffmpeg", "`ns-render` needs it (not for `dataset`), `ns-process-data` too; install the package ffmpeg"),
     ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
     ("Node.js", "npm", "pages (.html) are written by a program for it; install version 22 or newer from nodejs.org"),
 )

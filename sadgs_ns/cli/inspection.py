@@ -73,6 +73,9 @@ def load_run(path: Path, load_step: int | None = None, data: Path | None = None)
     checkpoint, state = chosen
     if data is not None:
         config.pipeline.datamanager.data = data
+    capture = config.pipeline.datamanager.data
+    if capture is not None and not capture.exists():
+        raise InputError(f"{capture.absolute()} does not exist: give --data the folder of the run's capture.")
     device = torch.device("cpu")
     if torch.cuda.is_available():
         device = torch.device("cuda")

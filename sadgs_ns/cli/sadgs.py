@@ -17,7 +17,7 @@ from rich.console import Console
 
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.cli.program import exit_code, parse
-from sadgs_ns.cli.sadgs_options import Sadgs
+from sadgs_ns.cli.sadgs_options import Sadgs, read_train_options
 from sadgs_ns.cli.sadgs_stages import export, measure, place_cameras, train
 from sadgs_ns.cli.status_line import StatusLine, clock
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         train_options = words[end + 1 :]
         words = words[:end]
     if "-h" in train_options or "--help" in train_options:
-        from sadgs_ns.training.run.start import read_options  # It imports torch.
+        from sadgs_ns.training.run.train_options import read_options  # It imports torch.
 
         read_options(train_options)  # It prints the help and exits.
     options = parse(Sadgs, "sadgs", words)
@@ -78,6 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     def run() -> int:
         with Interrupts(waiting=lambda: True):
             work = PhotosToSplat(options, train_options, console)
+            read_train_options(train_options)
             splats = make_splat(work)
         _print_end(work, splats, time.monotonic() - start)
         return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,14 @@ from sadgs_ns.formats import FORMATS, MESH, page_writer
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.options import check_size
+from sadgs_ns.worker import Worker, WorkerError
 
 FORMAT_NAMES = [suffix.removeprefix(".") for suffix in (*FORMATS, MESH)]
 _SET_OPTIONS = (
     "data", "output-dir", "experiment-name", "timestamp", "vis", "load-dir", "load-checkpoint", "load-config",
 )  # fmt: skip
 """Options of ns-train that this command sets."""
+_READING = "sadgs_ns.training.run.train_options:check_words"
 
 
 @dataclass
@@ -98,6 +101,17 @@ def check_options(options: Sadgs, train_options: Sequence[str]) -> None:
         name = option.partition("=")[0].lstrip("-").replace("_", "-")
         if option.startswith("--") and name in _SET_OPTIONS:
             raise InputError(f"--{name} is set by sadgs itself: leave it out, or use ns-train.")
+
+
+def read_train_options(train_options: Sequence[str]) -> None:
+    """Raise InputError if ns-train would not take the options, which takes three seconds, before cameras are found."""
+    if not train_options:
+        return
+    with tempfile.TemporaryDirectory() as folder, Worker(_READING, Path(folder) / "options.txt") as worker:
+        try:
+            worker.run(list(train_options), on_event=lambda event, **fields: None)
+        except WorkerError as error:
+            raise InputError(f"after --: {error}; `sadgs -- --help` lists the options.") from None
 
 
 def adapt_remedy(sentence: str, train_options: Sequence[str]) -> str:

@@ -63,6 +63,21 @@ def check_camera_types(cameras: Cameras) -> None:
             raise InputError(f"{problem}. {remedy}.")
 
 
+def check_drawn_cameras(cameras: Cameras) -> None:
+    """Raise InputError for the first of C cameras that a picture or a camera path asks for and that cannot be drawn.
+
+    The viewer's own types other than perspective cameras have no coefficients of a lens that could be undone.
+    """
+    coefficients = cameras.distortion_params  # [C, 6 or 12] or None
+    for index, number in enumerate(cameras.camera_type.flatten().tolist()):
+        camera_type = CameraType(number)
+        is_undistorted = camera_type in _UNDISTORTED and coefficients is not None and bool(coefficients[index].any())
+        if camera_type != CameraType.PERSPECTIVE and not is_undistorted:
+            problem = f"Camera {index} of the path is {camera_type.name}, which sadgs cannot draw"
+            raise InputError(f"{problem}: choose the camera type Perspective in the viewer, and save the path again.")
+    check_camera_types(cameras)
+
+
 def check_undistortion(cameras: Cameras, names: Sequence[Path]) -> None:
     """Raise InputError for the first of C fisheye images that became black when nerfstudio undistorted it.
 

@@ -19,6 +19,12 @@ from sadgs_ns.errors import reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp"}
 """Suffixes of the formats of photos that training reads."""
+VIDEO_SUFFIXES = {
+    ".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".webm", ".wmv",
+}  # fmt: skip
+"""Suffixes of videos in a folder."""
+UNSTITCHED_SUFFIXES = {".360", ".insp", ".insv"}
+"""Suffixes of photos and videos as 360° cameras store them: circles of two fisheye lenses, or faces of a cube."""
 MAX_AUTO_RESOLUTION = 1600  # Longest side in px up to which nerfstudio looks for no smaller copies of images
 UNREADABLE = (
     OSError, RuntimeError, SyntaxError, TypeError, ValueError, struct.error, Image.DecompressionBombError,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from sadgs_ns.errors import InputError, reason
 
 _CHANNELS = (("red", "green", "blue"), ("r", "g", "b"))  # Names that programs give to colours, in small letters
 _PREFIXES = ("", "diffuse_", "scalar_", "vertex_", "color_")  # These may stand before them.
+_COEFFICIENTS = [f"f_dc_{index}" for index in range(3)]  # Names that splats' files give to harmonics of degree 0
+_C0 = 0.5 / math.sqrt(math.pi)  # The spherical harmonic of degree 0
 GREY = 127  # Colour of points without one, in 0 … 255
 
 
@@ -21,7 +24,8 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return positions [P, 3] in the file's frame and colours in 0 … 255 [P, 3] of a PLY file, text or binary.
 
     Colours in the file may be of any type and reach to 1 (if they are floating-point numbers), 255 or 65,535, as the
-    largest one shows. Points without colours are grey. Raise InputError if the file is broken or holds no points.
+    largest one shows. Those of a splat are its harmonics of degree 0. Points without colours are grey. Raise
+    InputError if the file is broken or holds no points.
     """
     try:
         vertices = _read_vertices(path)
@@ -33,6 +37,10 @@ def read_points(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     except Exception as error:  # A damaged header may lead plyfile's parser to anything.
         raise InputError(f"{path} is not a PLY file of points ({reason(error)}): restore it.") from error
     channels = _find_channels(vertices.dtype)
+    if channels is None and set(_COEFFICIENTS) <= set(vertices.dtype.names or ()):
+        coefficients = np.stack([vertices[name] for name in _COEFFICIENTS], axis=-1).astype(np.float64)  # [P, 3]
+        values = 255 * (0.5 + _C0 * np.nan_to_num(coefficients))
+        return positions, np.rint(values.clip(0, 255)).astype(np.uint8)
     if channels is None:
         return positions, np.full(positions.shape, GREY, np.uint8)
     colors = np.stack([vertices[channel] for channel in channels], axis=-1).astype(np.float64)  # [P, 3]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.data.images import IMAGE_SUFFIXES, UNREADABLE, image_size
+from sadgs_ns.data.images import IMAGE_SUFFIXES, UNREADABLE, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES, image_size
 from sadgs_ns.data.layouts import automatic_options
 from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
@@ -24,8 +24,8 @@ from sadgs_ns.placing.video import is_archive
 
 COLMAP_FORMATS = {"JPEG", "MPO", "PNG", "BMP", "TIFF"}  # Pillow's names of the formats that COLMAP and OpenCV read
 _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
-_VIDEOS = {".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mts", ".ogv", ".webm", ".wmv"}
 _LONGEST_NAME = 255 - len(".jpg.png")  # Bytes of a name to which a conversion and its mask add these suffixes
+_UNSTITCHED = "files of 360° cameras (stitch them to panoramas or films of 2:1 with the camera's program)"
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
 _RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 """Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
@@ -44,6 +44,9 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
     `look_into`. Raise InputError if there are neither three photos nor a video, or a name is no Unicode.
     """
     if source.is_file():
+        if source.suffix.lower() in UNSTITCHED_SUFFIXES:
+            problem = f"{source} is a file of a 360° camera, as it stores it"
+            raise InputError(f"{problem}: stitch it to a panorama or film of 2:1 with the camera's program.")
         return [], True, {}, []
     if not source.is_dir():
         raise InputError(f"{source} does not exist; give a folder of photos or of videos, or a video.")
@@ -71,7 +74,7 @@ def find_source(source: Path, out: Path) -> tuple[list[str], bool, dict[str, str
 
 def find_videos(folder: Path) -> list[str]:
     """Return the names of a folder's videos, relative to it, in order."""
-    return [name for name in _visible_files(folder) if Path(name).suffix.lower() in _VIDEOS]
+    return [name for name in _visible_files(folder) if Path(name).suffix.lower() in VIDEO_SUFFIXES]
 
 
 def _visible_files(folder: Path) -> list[str]:
@@ -163,6 +166,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
 def _kind(path: Path) -> str:
     """Return "photos" by a file's suffix and content, even if damaged, `_NOT_READ` for other images, or ""."""
     suffix = path.suffix.lower()
+    if suffix in UNSTITCHED_SUFFIXES:
+        return _UNSTITCHED
     kind = ""
     start = b""
     if path.is_dir():

@@ -445,9 +445,14 @@ def summarize(
         identities = {image.name: image.image_id for image in opened.read_all_images()}
         pair_ids, inliers = opened.read_two_view_geometry_num_inliers()
         matches = dict.fromkeys(identities.values(), 0)
+        placed = {identities[name] for name in registered if name in identities}
+        related = set[int]()  # Photos that share matches with a registered one
         for pair, count in zip(pair_ids, inliers, strict=True):
-            for identity in pycolmap.pair_id_to_image_pair(pair):
+            both = pycolmap.pair_id_to_image_pair(pair)
+            for identity in both:
                 matches[identity] = max(matches[identity], count)
+            if count > 0 and not placed.isdisjoint(both):
+                related.update(both)
         for name in set(names) - registered:
             identity = identities.get(name)
             if identity is None:
@@ -458,6 +463,8 @@ def summarize(
                 left_out[name] = f"only {count} features: blurred, dark or without texture"
             elif matches[identity] < 30:
                 left_out[name] = "matches no other photo: too little overlap"
+            elif identity not in related:
+                left_out[name] = "matches none of the registered photos, only others that are left out: another scene?"
             else:
                 left_out[name] = "matches other photos, but its pose stayed ambiguous"
     error = model.compute_mean_reprojection_error()

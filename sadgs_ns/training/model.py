@@ -18,7 +18,7 @@ from pytorch_msssim import SSIM
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from sadgs_ns.data.cameras import camera_positions, check_camera_types, training_view
+from sadgs_ns.data.cameras import camera_positions, check_drawn_cameras, training_view
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.camera_paths import CameraPaths
@@ -378,7 +378,7 @@ class SadgsModel(SplatfactoModel):
             `rgb` [H, W, 3] in [0, 1]; `depth` [H, W, 1], the mean of the drawn Gaussians' depths along the viewing axis
             in the run's units, and the largest one where nothing is; `accumulation` [H, W, 1]; `background` [H, W, 3].
         """
-        check_camera_types(camera)
+        check_drawn_cameras(camera)
         pinhole = self.pinhole(camera)
         background = crop_background(self.background)
         rows = self.shown_rows(chosen)

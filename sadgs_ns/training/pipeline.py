@@ -60,7 +60,10 @@ class SadgsPipeline(VanillaPipeline):
 
     def __init__(self, config: SadgsPipelineConfig, *args: Any, **kwargs: Any) -> None:
         config.check()
-        opens_images = kwargs.get("test_mode") != "inference"  # This mode is for rendering new views.
+        mode = kwargs.get("test_mode", "val")
+        opens_images = mode != "inference"  # This mode is for rendering new views.
+        if mode != "val":  # The run is loaded, and no option of nerfstudio's commands names other data.
+            _check_data_of_run(config)
         for finding in findings_of(config.datamanager, open_images=opens_images):
             if finding.severity == "warning":
                 warn(finding.sentence)
@@ -71,6 +74,7 @@ class SadgsPipeline(VanillaPipeline):
         if opens_images and config.datamanager.cache_images != "compressed":
             self._store_images()
         self._warn_of_other_background()
+        self._warn_of_missing_masks()
         if config.model.backend == "auto" and backend == "gsplat":
             warn("Triton's kernels are not used: training takes about twice as long without them.")
         if self.model.poses is not None and isinstance(self.datamanager.config.dataparser, BlenderDataParserConfig):
@@ -119,6 +123,12 @@ class SadgsPipeline(VanillaPipeline):
                 f"The images were put on {behind_images}, the Gaussians lie on {behind_gaussians}: consider "
                 f"--pipeline.model.background-color {behind_images}."
             )
+
+    def _warn_of_missing_masks(self) -> None:
+        """Print a warning if an option names a colour for what masks hide, and the capture has no masks."""
+        color = getattr(self.datamanager.dataparser.config, "mask_color", None)
+        if color and self.datamanager.train_dataparser_outputs.mask_filenames is None:
+            warn("--mask-color does nothing, because the capture has no masks: leave it out, or name them.")
 
     def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
         """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
@@ -383,6 +393,16 @@ class SadgsPipeline(VanillaPipeline):
         self.views.sampler.load_state_dict(state["views"])
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+
+def _check_data_of_run(config: SadgsPipelineConfig) -> None:
+    """Raise InputError if the capture of a run that is loaded is not where the run's settings say."""
+    data = Path(config.datamanager.data or config.datamanager.dataparser.data)
+    if not data.exists():
+        remedy = f"put it there, or correct {data} in the run's config.yml"
+        if not data.is_absolute():
+            remedy = f"change to the folder in which training was started with `cd`, or correct {data} in config.yml"
+        raise InputError(f"{data.absolute()}, on which the run was trained, is not there: {remedy}.")
 
 
 def _sample(rows: Tensor) -> Tensor:

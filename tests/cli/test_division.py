@@ -21,7 +21,7 @@ from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.sadgs_stages import _train_command
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.errors import InputError
-from sadgs_ns.training.run.start import read_options
+from sadgs_ns.training.run.train_options import read_options
 
 VIEWS = [f"images/{i:02d}.png" for i in range(20)]
 PANORAMAS = [f"images/{i:02d}.jpg/{view}.jpg" for i in range(10) for view in range(8)]

@@ -253,7 +253,7 @@ def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, mon
     [
         ("nvcc", "nvcc", "note", "only the backend gsplat needs it", "the toolkit of torch's CUDA"),
         ("C compiler", "clang", "warning", "Triton compiles with it", "the packages gcc and python3-dev"),
-        ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it for videos", "the package ffmpeg"),
+        ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it (not for `dataset`)", "the package ffmpeg"),
         ("libusb-1.0", "usb-1.0", "warning", "`ns-export`, `ns-process-data` and meshes", "the package libusb-1.0-0"),
         ("Node.js", "npm", "warning", "pages (.html)", "version 22 or newer from nodejs.org"),
     ],

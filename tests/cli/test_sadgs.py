@@ -300,16 +300,35 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert lines_of(printed.out) == {
         "cameras": f"{printed.err.split()[2]} of 11 photos registered after a second attempt"
     }
-    assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
+    assert main([*command, "--anyway", "--", "--steps-per-save", "-1"]) == 2
     printed = capsys.readouterr()
     assert lines_of(printed.out)["cameras"].endswith(" of 11 photos registered after a second attempt; done before")
     log = tmp_path / "out" / "log" / "training.txt"
-    told = r"sadgs: training: Unrecognized options: --no-such-option\. All that it printed is in "
+    told = r"sadgs: training: steps_per_save must be at least 0, got -1\. All that it printed is in "
     assert re.match(told, printed.err) and str(log) in printed.err
     assert "$ ns-train sadgs --data " in log.read_text("utf8")
     shutil.copy2(sorted(photos.iterdir())[6], source)
     assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
     assert "(photos added: 1, such as 06.png); give another folder or delete it." in capsys.readouterr().err
+
+
+@pytest.mark.hard_case("a typing error in the options after `sadgs … --`", "refused before cameras are found")
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--no-such-option"], "Unrecognized options: --no-such-option"),
+        (["--max-num-iterations", "many"], "invalid choice|[Ee]rror parsing|invalid"),
+    ],
+)
+def test_options_for_training_are_read_before_cameras_are_found(
+    words: list[str], told: str, photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "out"
+    assert main([str(photos), "--output", str(folder), "--formats", "ply", "--", *words]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("sadgs: after --: ") and re.search(told, printed)
+    assert printed.endswith("; `sadgs -- --help` lists the options.\n") and printed.count("\n") == 1
+    assert not folder.exists()
 
 
 def test_the_command_that_compares_more_pairs_keeps_the_size(

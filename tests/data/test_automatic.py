@@ -221,18 +221,21 @@ def test_masks_are_read_by_the_names_in_use(called: str, scene: Path, tmp_path: 
 
 
 @pytest.mark.hard_case(
-    "`--data` is a part of a capture (`images`, `sparse/0`), the folder above one, or a file",
-    "refused: says which folder to give",
+    "`--data` is a part of a capture (`images`, `sparse/0`), the folder above one, a file, or a video",
+    "refused: says which folder to give, or which command makes one",
 )
 def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tmp_path: Path):
     data = tmp_path / "above" / "capture"
     shutil.copytree(scene, data)
     (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
     (data / "other").mkdir()
+    (data / "a clip.MP4").touch()
+    makes = f"`sadgs-process '{data}/a clip.MP4' FOLDER` makes one of it, and `sadgs` a splat."
     for folder, sentence in (
         (data / "images", f"{data}/images is a part of the capture {data}: give --data that folder."),
         (data / SPARSE_FOLDER, f"{data}/sparse/0 is a part of the capture {data}: give --data that folder."),
         (data.parent, f"{data.parent} is no capture, but {data} in it is one: give --data that folder."),
+        (data / "a clip.MP4", f"{data}/a clip.MP4 is a video and no capture: {makes}"),
         (data / "photo.png", f"{data}/photo.png is a file: give --data the folder of a capture."),
     ):
         (finding,) = check_data(folder)

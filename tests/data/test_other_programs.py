@@ -8,6 +8,7 @@ import math
 import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
+from helpers import forked_python
 from helpers.short_runs import blender_data, nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
@@ -227,6 +229,30 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
 
 
 @pytest.mark.hard_case(
+    "a Blender scene whose files have focal lengths instead of angles of view",
+    "refused once: renamed to transforms.json, it trains",
+)
+@pytest.mark.parametrize("in_frames", [False, True])
+def test_focal_lengths_in_a_blender_scene_are_refused_before_missing_angles(
+    in_frames: bool, write: Callable[..., Path]
+):
+    def of_file(meta: dict[str, Any]) -> None:
+        del meta["camera_angle_x"]
+        if not in_frames:
+            meta["fl_x"] = FOCAL
+
+    def of_frame(frame: dict[str, Any]) -> None:
+        if in_frames:
+            frame["fl_x"] = FOCAL
+
+    data = write(of_file, of_frame, kind="blender")
+    (said,) = errors(data)
+    assert said == f"{data}/transforms_train.json: of Blender scenes fl_x is not read; rename it to transforms.json."
+    (data / "transforms_train.json").rename(data / "transforms.json")
+    assert errors(data) == []
+
+
+@pytest.mark.hard_case(
     "an image that is there with another suffix, in other case, or in another folder than a `transforms.json` (also of "
     "Windows) or a Blender scene says",
     "refused: the sentence names the file that is there",
@@ -275,7 +301,7 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
     from nerfstudio.scripts import process_data
 
     data = tmp_path / "my export"
-    for path in (data / file, data / photos / "1.jpg"):
+    for path in (data / file, data / photos / "1.jpg", data / "keyframes/depth/1.png"):
         path.parent.mkdir(parents=True, exist_ok=True)
     (data / file).write_text(content)
     Image.new("RGB", (8, 8)).save(data / photos / "1.jpg")
@@ -290,6 +316,51 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
     for name, value in options.items():
         assert getattr(command, name).name == value
     assert poses_elsewhere(data) == said and poses_elsewhere(tmp_path / "out") is None
+
+
+@pytest.mark.hard_case(
+    "a capture of Polycam without LiDAR", "the command makes the folder of depth that `ns-process-data` asks for"
+)
+def test_a_capture_of_polycam_without_depth_is_converted_with_its_poses(tmp_path: Path):
+    """In a process of its own, nerfstudio's script needs neither Open3D nor FFmpeg, which a machine may lack."""
+    data = tmp_path / "my capture"
+    pose = {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
+    camera = {"fx": 90.0, "fy": 90.0, "cx": 50.0, "cy": 40.0, "width": 100, "height": 80, "blur_score": 99.0}
+    for name in ("keyframes/images/1.jpg", "keyframes/cameras/1.json"):
+        (data / name).parent.mkdir(parents=True)
+    Image.new("RGB", (100, 80)).save(data / "keyframes/images/1.jpg")
+    (data / "keyframes/cameras/1.json").write_text(json.dumps(pose | camera))
+    (said,) = errors(data)
+    converting = f"ns-process-data polycam --data '{data}' --output-dir FOLDER"
+    making = f"mkdir '{data}'/keyframes/depth"
+    assert said == f"{data}/keyframes/cameras/1.json has poses: `{making} && {converting}` keeps them."
+    code = f"""
+import sys
+from pathlib import Path
+from unittest.mock import MagicMock
+sys.modules["open3d"] = MagicMock()
+from nerfstudio.process_data import process_data_utils
+from nerfstudio.scripts.process_data import ProcessPolycam
+process_data_utils.copy_images_list = lambda images, image_dir, **others: [image_dir / image.name for image in images]
+ProcessPolycam(data=Path({str(data)!r}), output_dir=Path({str(tmp_path / "out")!r})).main()
+"""
+    assert "Depth map directory" in forked_python.python(code).stderr
+    subprocess.run(making, shell=True, check=True)
+    assert forked_python.python(code).returncode == 0
+    (frame,) = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    assert frame["fl_x"] == 90
+    assert errors(data) == [f"{data}/keyframes/cameras/1.json has poses: `{converting}` keeps them."]
+
+
+@pytest.mark.hard_case("poses of LLFF (`poses_bounds.npy`) or in a `capture.json`", "the file is named: it is not read")
+@pytest.mark.parametrize("name", ["poses_bounds.npy", "capture.json"])
+def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path, tmp_path: Path):
+    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    (tmp_path / name).touch()
+    computing = f"`sadgs-process {tmp_path}/images FOLDER` computes others"
+    problem = f"{tmp_path / name} may have poses, but in a format that is not read"
+    said = f"{problem}: write them to a transforms.json to keep them; {computing}."
+    assert errors(tmp_path) == [said] == [poses_elsewhere(tmp_path)]
 
 
 @pytest.mark.hard_case(

@@ -48,7 +48,7 @@ from sadgs_ns.placing import features, place, reconstruct
 from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_masks
-from sadgs_ns.placing.folder import find_source, look_into
+from sadgs_ns.placing.folder import find_source, find_videos, look_into
 from sadgs_ns.placing.options import PlacingOptions
 from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
 from sadgs_ns.placing.place import Placed, place_photos
@@ -301,6 +301,32 @@ def test_the_summary_has_the_reasons_that_speak_against_a_model(run: Run, photos
     assert summary.doubts[0].startswith("their focal lengths across and down would differ by a factor of 1.4: ")
 
 
+@pytest.mark.hard_case("photos of two scenes in one folder", "those of the smaller one are said to share nothing")
+def test_photos_of_another_scene_share_nothing_with_those_that_registered(
+    run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(reconstruct, "FEW_FEATURES", 1)
+    model = pycolmap.Reconstruction(run.out / "work" / "model")
+    names = sorted(photo.name for photo in photos.iterdir())
+    placed, alone, other = names[:3]
+    for image in list(model.images.values()):
+        if image.name != placed:
+            model.deregister_frame(image.frame_id)
+    database = Path(shutil.copy(run.out / "work" / "database.db", tmp_path))
+    with pycolmap.Database.open(database) as opened:
+        identities = {image.name: image.image_id for image in opened.read_all_images()}
+        opened.clear_two_view_geometries()
+        for one, two in ((placed, other), (alone, names[3])):
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = np.stack([np.arange(40, dtype=np.uint32)] * 2, axis=1)
+            opened.write_two_view_geometry(identities[one], identities[two], geometry)
+    left_out = reconstruct.summarize(names[:4], model, database, "exhaustive", "").left_out
+    assert left_out[other] == "matches other photos, but its pose stayed ambiguous"
+    share_nothing = "matches none of the registered photos, only others that are left out: another scene?"
+    assert left_out[alone] == left_out[names[3]] == share_nothing
+
+
 # nerfstudio opens the first photo to learn its size and does not close it.
 OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pytest.PytestUnraisableExceptionWarning")
 
@@ -410,6 +436,31 @@ def test_an_archive_of_photos_is_no_video(kind: str, tmp_path: Path, capsys):
     assert main([str(archive.parent), str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.hard_case(
+    "`.insp`, `.insv` and `.360`, as 360° cameras store photos and videos", "left out with a count, or refused: stitch"
+)
+@pytest.mark.parametrize("suffix", [".insp", ".INSV", ".360"])
+def test_files_of_360_degree_cameras_must_be_stitched(suffix: str, tmp_path: Path, capsys):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i in range(3):
+        Image.new("RGB", (64, 32)).save(folder / f"{i}{suffix}", "JPEG")
+    assert main([str(folder), str(tmp_path / "out")]) == 2
+    stitch = "(stitch them to panoramas or films of 2:1 with the camera's program): 3, such as 0"
+    sentence = f"better 30 or more. Left out as files of 360° cameras {stitch}{suffix}.\n"
+    assert sentence in capsys.readouterr().err
+    assert main([str(folder / f"0{suffix}"), str(tmp_path / "out")]) == 2
+    assert "stitch it to a panorama or film of 2:1 with the camera's program." in capsys.readouterr().err
+
+
+@pytest.mark.hard_case("videos of camcorders (`.mts`, `.mxf`, `.mpeg`) in a folder", "read as others")
+def test_videos_of_camcorders_are_videos(tmp_path: Path):
+    names = ["a.MTS", "b.mxf", "c.mpeg"]
+    for name in names:
+        (tmp_path / name).touch()
+    assert find_videos(tmp_path) == names
 
 
 @pytest.mark.hard_case("a single photo, or a text, instead of photos", "refused")

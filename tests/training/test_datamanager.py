@@ -438,6 +438,15 @@ def test_points_without_colours_are_noted(colors: np.ndarray | None, tmp_path: P
     assert any("without colours" in note for note in notes) == (colors is None)
 
 
+@pytest.mark.hard_case("a splat's PLY as points", "read with its colours of degree 0")
+def test_colours_of_a_splat_are_those_of_degree_0(tmp_path: Path):
+    coefficients = (COLORS / 255 - 0.5) / 0.28209479177387814
+    coefficients[0] = [9, -9, np.nan]
+    ply_scene(tmp_path, colors=coefficients.astype(np.float32), names=[f"f_dc_{index}" for index in range(3)])
+    _, colors = ply.read_points(tmp_path / "points.ply")
+    assert colors.tolist() == [[255, 0, 128], *COLORS[1:].tolist()]
+
+
 def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):
     (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n")
     with pytest.raises(InputError, match=r"points\.ply is not a PLY file of points \(.+\): restore it\.$"):

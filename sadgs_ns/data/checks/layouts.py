@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.images import images_in
+from sadgs_ns.data.images import VIDEO_SUFFIXES, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
 from sadgs_ns.data.transforms import GIVE_POSES
 
@@ -14,29 +14,41 @@ _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
     "kapture_export_colmap.py -i KAPTURE -db KAPTURE/colmap.db -txt {data}/sparse"
 )
+_POLYCAM = "keyframes/cameras/*.json"
 _EXPORTS = {
     "*.xml": (b"<chunk", "ns-process-data metashape --data {photos} --xml {file} --output-dir FOLDER"),
     "*.psx": (b"", "ns-process-data metashape --data {photos} --xml EXPORTED.xml --output-dir FOLDER"),
     "*.csv": (b"#name,", "ns-process-data realitycapture --data {photos} --csv {file} --output-dir FOLDER"),
     "*.xmp": (b"xcr:Rotation", "ns-process-data realitycapture --data {photos} --csv EXPORTED.csv --output-dir FOLDER"),
     "odm_report/shots.geojson": (b"", "ns-process-data odm --data {data} --output-dir FOLDER"),
-    "keyframes/cameras/*.json": (b"", "ns-process-data polycam --data {data} --output-dir FOLDER"),
+    _POLYCAM: (b"", "ns-process-data polycam --data {data} --output-dir FOLDER"),
     "metadata.json": (b'"poses"', "ns-process-data record3d --data {data} --output-dir FOLDER"),
     "reconstruction.json": (b'"shots"', "opensfm export_colmap {data} && mv {data}/colmap_export {data}/sparse"),
     "*sfm*": (b'"poses"', "aliceVision_exportColmap --input {file} --output FOLDER --copyImages true"),
     "bundle.out": (b"# Bundle", _BUNDLER),
 }
 """Files with other programs' poses, a part of their content, and the command that reads them."""
+_UNREAD = ("poses_bounds.npy", "capture.json")
+"""Files with poses that no command reads: those of LLFF, and those of some apps for phones."""
 
 
 def poses_elsewhere(data: Path) -> str | None:
-    """Return the sentence for a folder with another program's poses, which a command reads, or None."""
+    """Return the sentence for a folder with another program's poses, which a command reads or none does, or None."""
     for pattern, (mark, command) in _EXPORTS.items():
         for file in sorted(data.glob(pattern)):
             if file.is_file() and mark in file.read_bytes():
                 paths = {"file": file, "photos": _folder_of_photos(data), "data": data}
                 quoted = {name: shlex.quote(str(path)) for name, path in paths.items()}
+                if pattern == _POLYCAM and not (data / "keyframes" / "depth").exists():
+                    # Captures without LiDAR lack the folder, which the command asks for and does not read.
+                    command = f"mkdir {{data}}/keyframes/depth && {command}"
                 return f"{file} has poses: `{command.format(**quoted)}` keeps them."
+    for name in _UNREAD:
+        file = data / name
+        if file.is_file():
+            compute = f"sadgs-process {shlex.quote(str(_folder_of_photos(data)))} FOLDER"
+            problem = f"{file} may have poses, but in a format that is not read"
+            return f"{problem}: write them to a transforms.json to keep them; `{compute}` computes others."
     return None
 
 
@@ -57,10 +69,8 @@ def no_layout(data: Path) -> str:
         run = shlex.quote(str(config))
         shown = f"`ns-viewer --load-config {run}` shows it"
         return f"{data} is a run and no capture: {shown}, and `sadgs-export {run} --output splat.ply` exports it."
-    if not data.exists():
-        return f"{data} does not exist: give --data the folder of a capture."
     if not data.is_dir():
-        return f"{data} is a file: give --data the folder of a capture."
+        return _no_folder(data)
     models = find_reconstructions(data)
     if models:
         model = data / next(iter(models))
@@ -91,6 +101,16 @@ def no_layout(data: Path) -> str:
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _no_folder(data: Path) -> str:
+    """Return the sentence for a path that is no folder."""
+    if not data.exists():
+        return f"{data} does not exist: give --data the folder of a capture."
+    if data.suffix.lower() in VIDEO_SUFFIXES:
+        command = f"sadgs-process {shlex.quote(str(data))} FOLDER"
+        return f"{data} is a video and no capture: `{command}` makes one of it, and `sadgs` a splat."
+    return f"{data} is a file: give --data the folder of a capture."
 
 
 def _capture_around(folder: Path) -> Path | None:

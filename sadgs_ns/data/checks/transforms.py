@@ -193,6 +193,8 @@ def _blender_views(
         checked = [meta, *meta["frames"]]
     else:
         width = height = 1  # The other checks need no size.
+    if "camera_angle_x" not in meta:
+        _refuse_unread_intrinsics([meta, *meta["frames"]], path)
     focal = focal_length(meta, width, "camera_angle_x", str(path))
     camera = Camera(width, height, focal, focal, width / 2, height / 2)
     for values in checked:
@@ -211,7 +213,18 @@ def _check_blender_intrinsics(values: dict[str, Any], camera: Camera, path: Path
     for name, value in expected.items():
         given = finite(values.get(name, value), name, str(path))
         if abs(given - value) > 1e-3 * value:
-            raise InputError(f"{path}: of Blender scenes {name} is not read; rename it to transforms.json.")
+            raise _unread_intrinsic(name, path)
+
+
+def _refuse_unread_intrinsics(described: Sequence[dict[str, Any]], path: Path) -> None:
+    """Raise InputError if values of a file or its frames have intrinsics in the place of the angle that is read."""
+    for name in ("fl_x", "fl_y", "camera_angle_y", "camera_angle_x"):
+        if any(name in values for values in described):
+            raise _unread_intrinsic(name, path)
+
+
+def _unread_intrinsic(name: str, path: Path) -> InputError:
+    return InputError(f"{path}: of Blender scenes {name} is not read; rename it to transforms.json.")
 
 
 def _check_blender_training(views: Sequence[View], data: Path, path: Path, options: ParserOptions) -> Iterator[Finding]:

@@ -1,12 +1,9 @@
 """Start training for `sadgs` as `ns-train sadgs` does, without importing all of nerfstudio."""
 
-# ruff: noqa: E402 - what takes seconds begins before what is imported meanwhile
 from __future__ import annotations
 
-import copy
 import random
 import sys
-from collections.abc import Sequence
 
 from sadgs_ns.training.kernels_ahead import compile_ahead
 
@@ -15,25 +12,12 @@ if {"-h", "--help"}.isdisjoint(sys.argv):
 
 import numpy as np
 import torch
-import tyro
-from tyro.conf import FlagConversionOff, SuppressFixed
 
 from sadgs_ns.events import report
-from sadgs_ns.training.run.deferred_imports import import_nerfstudio
+from sadgs_ns.training.run.train_options import read_options  # This comes before any import of nerfstudio.
 
-import_nerfstudio()  # This comes before any import of nerfstudio.
-
-from nerfstudio.engine.trainer import TrainerConfig
-
-from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.presets import sadgs
+# isort: split
 from sadgs_ns.training.run import trainer  # noqa: F401 - a run's config imports it when it begins
-
-
-def read_options(words: Sequence[str]) -> TrainerConfig:
-    """Return what these options of `ns-train sadgs` ask for, or print an error or their help, and exit."""
-    annotated = SuppressFixed[FlagConversionOff[SadgsTrainerConfig]]  # as nerfstudio annotates its methods
-    return tyro.cli(annotated, prog="ns-train sadgs", args=words, default=copy.deepcopy(sadgs.config))
 
 
 def train() -> None:

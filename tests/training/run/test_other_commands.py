@@ -10,6 +10,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import types
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.render import DatasetRender, RenderCameraPath, RenderInterpolated, SpiralRender
 from nerfstudio.utils import install_checks, writer
@@ -126,7 +128,7 @@ def path_command(config: Path, folder: Path, text: str | bytes | None, **options
 
 @pytest.mark.hard_case(
     "`ns-render camera-path` with a path that is missing, empty, cut off, of another program, not UTF-8, without "
-    "cameras, of 0 seconds or of 0 px",
+    "cameras, of 0 seconds or of 0 px, of a fisheye or 360°",
     "one sentence",
 )
 @pytest.mark.parametrize("run", [1], indirect=True)
@@ -170,6 +172,13 @@ def path_command(config: Path, folder: Path, text: str | bytes | None, **options
         (
             json.dumps(PATH | {"seconds": 0}),
             r"The camera path lasts 0 seconds: give it a longer duration in the viewer",
+        ),
+        *(
+            (
+                json.dumps(PATH | {"camera_type": kind}),
+                r"Camera 0 of the path is \w+, which sadgs cannot draw: choose the camera type Perspective in",
+            )
+            for kind in ("fisheye", "equirectangular")
         ),
         (
             json.dumps(PATH | {"render_height": 0}),
@@ -277,6 +286,31 @@ def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp
     assert said_of(ComputePSNR(run[1], tmp_path / "results.txt")) == (
         "--output-path must end with .json: give the file of results another name."
     )
+
+
+@pytest.mark.hard_case(
+    "`ns-eval` or `ns-viewer` of a run whose capture is not where its `config.yml` says, as from another folder",
+    "one sentence: change to the folder of training, or correct the path",
+)
+@pytest.mark.parametrize("run", [1], indirect=True)
+@pytest.mark.parametrize(
+    ("folder", "remedy"),
+    [
+        ("scene", "change to the folder in which training was started with `cd`, or correct scene in config.yml."),
+        ("/no/scene", "put it there, or correct /no/scene in the run's config.yml."),
+    ],
+)
+def test_a_run_from_another_folder_says_where_its_capture_was(
+    folder: str, remedy: str, run: tuple[int, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    moved = Path(shutil.copytree(run[1].parent, tmp_path / "run")) / "config.yml"
+    config = yaml.load(moved.read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path(folder)
+    config.output_dir = tmp_path
+    moved.write_text(yaml.dump(config))
+    monkeypatch.chdir(tmp_path)
+    for command in (ComputePSNR(moved), path_command(moved, tmp_path, json.dumps(PATH))):
+        assert said_of(command) == f"{Path(folder).absolute()}, on which the run was trained, is not there: {remedy}"
 
 
 @pytest.mark.hard_case(

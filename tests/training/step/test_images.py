@@ -19,6 +19,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
+from helpers.kill_and_resume import set_up
 from helpers.short_runs import blender_data, checkpoint, configure, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.cli.inspection import get_view
@@ -151,6 +152,16 @@ def test_hidden_pixels_get_the_parser_s_colour(tmp_path: Path):
         hidden = data["image"][~data["mask"][..., 0]]
         assert (hidden == torch.tensor([1, 0, 0])).all() and len(hidden) > 0
         assert data["image"][data["mask"][..., 0]].float().std() > 1
+
+
+@pytest.mark.hard_case("`--mask-color` without masks", "trains; a warning says that it does nothing")
+def test_a_colour_for_what_masks_hide_is_of_no_use_without_masks(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    said = "--mask-color does nothing, because the capture has no masks: leave it out, or name them."
+    for masks in (True, False):
+        parser = nerfstudio_data(tmp_path / str(masks), masks=masks)
+        parser.mask_color = (1.0, 0.0, 0.0)
+        set_up(configure(tmp_path / "run", parser))
+        assert (said in capsys.readouterr().out) == (not masks)
 
 
 @pytest.mark.parametrize("options", [{}, {"camera_res_scale_factor": 0.5}], ids=str)
