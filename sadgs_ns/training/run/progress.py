@@ -113,18 +113,28 @@ class ProgressTable(LocalWriter):
             self._live = Live(console=CONSOLE, auto_refresh=False)
 
     def write_stats_log(self, step: int) -> None:
-        """Add a row if the step is due for one; nerfstudio calls this after every step, and once after the last."""
-        events = {event["name"]: event["event"] for event in writer.EVENT_STORAGE}
-        if EventName.ITER_TRAIN_TIME.value not in events:  # Training is over.
+        """Add a row if an iteration is due for one; nerfstudio calls this after each, and once after the last.
+
+        nerfstudio gives the step of its first event. After a resumed run's first iteration that is the configuration's,
+        which is 0, so the step is read from the iteration's own event. This iteration is the first moment of the
+        run's times, and is reported even if no row is due, so that nobody waits for where the run goes on.
+        """
+        stored = {event["name"]: event for event in writer.EVENT_STORAGE}
+        if EventName.ITER_TRAIN_TIME.value not in stored:  # Training is over.
             self.stop()
             return
-        if step % writer.GLOBAL_BUFFER["steps_per_log"] != 0:
+        step = stored[EventName.ITER_TRAIN_TIME.value]["step"]
+        is_due = step % writer.GLOBAL_BUFFER["steps_per_log"] == 0
+        if not is_due and self._first is not None:
             return
-        cells = _cells(events)  # On CUDA this waits for the step.
         total = writer.GLOBAL_BUFFER["max_iter"]
+        cells = []
+        if is_due:
+            cells = _cells({name: event["event"] for name, event in stored.items()})  # On CUDA this waits for the step.
         pace, left = self._timing(step, total, time.monotonic())
         report("iteration", step=step, left=left)
-        self._show(_line([f"{step} ({step / total:.2%})", *cells, pace, left]))
+        if is_due:
+            self._show(_line([f"{step} ({step / total:.2%})", *cells, pace, left]))
 
     def _timing(self, step: int, total: int, now: float) -> tuple[str, str]:
         """Add the time of a row, and return the time of an iteration and the time left, each "" if it is not known."""

@@ -15,6 +15,7 @@ import pytest
 import torch
 import tyro
 from nerfstudio.configs.base_config import LocalWriterConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.scripts.viewer.run_viewer import RunViewer
 from nerfstudio.utils import writer
@@ -52,7 +53,7 @@ def events(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
 
 def log(table: ProgressTable, events: list[dict[str, Any]], step: int, loss: Any = None) -> None:
     """Hand the table what nerfstudio does after an iteration; the loss and metrics only where a row is due."""
-    events[:] = [{"name": EventName.ITER_TRAIN_TIME.value, "event": 0.1}]
+    events[:] = [{"name": EventName.ITER_TRAIN_TIME.value, "event": 0.1, "step": step}]
     if loss is not None:
         metrics = {"psnr": torch.tensor(20.0 + step), "gaussian_count": 1000 * step}
         events += [{"name": "Train Loss", "event": loss}, {"name": "Train Metrics Dict", "event": metrics}]
@@ -104,6 +105,53 @@ def test_after_densification_the_time_left_goes_by_the_latest_rows(
         clock[0] += seconds
         log(table, events, step)
     assert capsys.readouterr().out.splitlines()[-1].split()[-4:] == ["1.0", "s", "19", "s"]
+
+
+@pytest.mark.hard_case(
+    "a resumed run", "reports the iteration at which it goes on, and its time left by the iterations since then"
+)
+def test_the_time_left_of_a_resumed_run_counts_its_own_iterations(
+    config: SadgsTrainerConfig,
+    tmp_path: Path,
+    clock: list[float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    """It is resumed from iteration 13 of 24, and each takes two seconds of the tests' clock."""
+    config.output_dir = tmp_path
+    config.max_num_iterations = 24
+    config.steps_per_save = 0
+    stopped = set_up(config)
+
+    def stop(step: int) -> None:
+        if step == 13:
+            stopped.stop_training = True
+
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    stopped.callbacks.append(TrainingCallback(location, stop))
+    stopped.train()
+    capsys.readouterr()
+
+    checkpoints = config.get_checkpoint_dir()
+    (last,) = checkpoints.glob("step-*.ckpt")
+    first = int(last.stem.removeprefix("step-")) + 1
+    config.load_dir = checkpoints
+    config.logging.local_writer.enable = True
+    config.logging.steps_per_log = 4
+    reported: list[dict[str, Any]] = []
+    monkeypatch.setattr(progress, "report", lambda event, **fields: reported.append({"event": event, **fields}))
+    resumed = set_up(config)
+
+    def pass_time(step: int) -> None:
+        clock[0] += 2.0
+
+    resumed.callbacks.append(TrainingCallback(location, pass_time))
+    resumed.train()
+    iterations = [fields for fields in reported if fields["event"] == "iteration"]
+    assert [fields["step"] for fields in iterations] == [first, 16, 20]
+    assert iterations[-1]["left"] == "6 s", "three iterations of two seconds"
+    shown = re.findall(r"^(\d+) \(.+%\) .*", capsys.readouterr().out, re.MULTILINE)
+    assert shown == ["16", "20"]
 
 
 def test_the_time_left_is_within_30_percent_on_all_captures_whose_times_were_kept():
