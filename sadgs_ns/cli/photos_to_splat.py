@@ -111,6 +111,8 @@ class PhotosToSplat:
                 settings.trained = None
                 settings.measured = None
                 settings.run = f"run-{int(time.time())}"
+            elif self.results.retraining:
+                self.console.print(self.results.begin_another_run(), markup=False, soft_wrap=True)
             self.results.write_settings()
             if self.added or self.results.trained() is None:
                 self._trainer = self.worker("training", _TRAINING)  # Meanwhile it imports what training needs.

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
+import time
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
+from sadgs_ns.cli.division import divides
 from sadgs_ns.cli.given_cameras import GivenCameras
+from sadgs_ns.cli.sadgs_options import FORMAT_NAMES
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings, write_json
 
@@ -73,6 +77,8 @@ class SadgsFolder:
         scene: The folder of new cameras.
         runs: The folder of the runs.
         settings: What settings.json holds, or will hold when the work begins.
+        retraining: The options that differ from those of the present run, which another run follows, as parts of a
+            sentence; empty if that run goes on.
     """
 
     def __init__(self, path: Path) -> None:
@@ -80,6 +86,7 @@ class SadgsFolder:
         self.scene = path / "scene"
         self.runs = path / "training" / "sadgs"
         self.settings = Settings()
+        self.retraining: list[str] = []
         self._file = path / "settings.json"
 
     @property
@@ -88,11 +95,13 @@ class SadgsFolder:
         return self.runs / self.settings.run
 
     def read_settings(self, chosen: Settings, given: GivenCameras | None) -> None:
-        """Read the settings that the folder was begun with, and replace those that nothing depends on yet.
+        """Read the settings that the folder was begun with, and replace those that another run can follow.
 
         Raise InputError if the others differ from those that the options have `chosen`, if images of given cameras
-        changed since training began, or if the folder is something else.
+        changed since training began, if options of a training that was stopped differ, or if the folder is something
+        else.
         """
+        self.retraining = []
         begun = Settings.read(self._file, self.path)
         if begun is None:
             if self.path.is_file() or (self.path.is_dir() and any(self.path.iterdir())):
@@ -109,22 +118,60 @@ class SadgsFolder:
         if differences:
             problem = f"{self.path} was begun with other settings ({'; '.join(differences)})"
             raise InputError(f"{problem}; give another --output or delete it.")
+        if self.checkpoint():
+            self.retraining = self._named_differences(chosen, ["effort", "train_options"])
+        if self.retraining and self.trained() is None:  # An option that was left out would cost an unfinished run.
+            problem = f"training in {self.path} was stopped with other options ({'; '.join(self.retraining)})"
+            remedy = f"give these to resume, or delete {self.runs} to train anew on the same cameras"
+            raise InputError(f"{problem}; {remedy}.")
         self.settings = replace(begun, **{name: getattr(chosen, name) for name in _OPTION_NAMES})
 
     def _differences(self, chosen: Settings) -> list[str]:
-        """Return the settings that differ and that something was made with, as parts of a sentence."""
+        """Return the settings that differ and that something was made with, as parts of a sentence.
+
+        Other options of training are not among them, unless they divide the views, which a scene notes once.
+        """
         decided = ["source", "cameras"]
         if self.has_scene():
             decided.append("max_size")
         if self.checkpoint():
-            decided += ["effort", "train_options", "measure"]
+            decided.append("measure")
+            if divides(self.settings.train_options or []) or divides(chosen.train_options or []):
+                decided.append("train_options")
+        return self._named_differences(chosen, decided)
+
+    def _named_differences(self, chosen: Settings, names: list[str]) -> list[str]:
+        """Return those of some settings that differ, as parts of a sentence."""
         differences = []
-        for name in decided:
+        for name in names:
             before = getattr(self.settings, name)
             now = getattr(chosen, name)
             if before != now:
                 differences.append(f"{_OPTION_NAMES[name]} was {_shown(before)}, is {_shown(now)}")
         return differences
+
+    def begin_another_run(self) -> str:
+        """Begin a run with other options of training on the same scene, and return the sentence on it.
+
+        The splats of the present run are moved to a folder of their own first, so that they are kept also where the
+        work ends before the settings are written.
+        """
+        sentence = f"Training begins anew on the same cameras ({'; '.join(self.retraining)})"
+        kept = self.path / "earlier" / self.settings.run
+        splats = [self.splat(name) for name in FORMAT_NAMES if self.splat(name).is_file()]
+        for splat in splats:
+            kept.mkdir(parents=True, exist_ok=True)
+            os.replace(splat, kept / splat.name)
+        if splats:
+            sentence += f"; the earlier splat is kept in {kept}"
+        number = int(time.time())
+        while (self.runs / f"run-{number}").exists():
+            number += 1
+        self.settings.run = f"run-{number}"
+        self.settings.trained = None
+        self.settings.measured = None
+        self.retraining = []
+        return f"{sentence}."
 
     def write_settings(self) -> None:
         """Write settings.json."""

@@ -32,7 +32,8 @@ def place_cameras(work: PhotosToSplat, line: StatusLine) -> str:
         return f"those of {work.given.file}; --cameras new finds others"
     _mention_cameras_above(work.source, line)
     settings = work.results.settings
-    goes_on = work.options.anyway or work.results.checkpoint() is not None
+    has_trained = settings.views is not None or work.results.checkpoint() is not None
+    goes_on = work.options.anyway or has_trained
     if settings.few and goes_on and not work.added:
         return f"{settings.few}; done before"
     worker = work.worker("cameras", _PLACING)

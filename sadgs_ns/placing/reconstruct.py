@@ -56,8 +56,8 @@ own are 6 and 16; of 200 frames of a room it looked 10 s for two with 16 and the
 _RELAXED = {"init_max_forward_motion": 1.0, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Limits of a second attempt (COLMAP's own: .95, 16° and 30), which takes .9 to 1.5 times as long as a first."""
 _ENOUGH, _MOST_STRETCH = 0.9, 0.1
-"""Share of the photos that suffices at the first attempt, and the largest difference of the two focal lengths: those
-of lenses and of resized photos differ less, those of models that went wrong more."""
+"""Share of the photos, or of those that are added, that suffices at the first attempt, and the largest difference of
+the two focal lengths: those of lenses and of resized photos differ less, those of models that went wrong more."""
 _SEED_STEP = 1000  # Seeds of one placing lie this far apart, so that those of benchmarks, 0, 1, 2, …, share none
 _DISAGREEMENT = "disagreement.txt"  # File in a model's folder that holds `Measures.disagreement`
 FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
@@ -238,8 +238,9 @@ def place_cameras(
         raise InputError(_unrelated(names, database))
     if best is None or (before is not None and best.num_reg_images() <= before.num_reg_images()):
         raise InputError(
-            "none of the photos that were added could be related to the others: take some that share two thirds of "
-            "what they show with each other and with those that are there, or take these out of the folder again."
+            "none of the photos that were added could be related to the others: give another output folder, for which "
+            "all photos are placed together; take some that share two thirds of what they show with each other and "
+            "with those that are there; or take these out of the folder again."
         )
     moved = math.nan
     if before is None and not is_firm(best):
@@ -386,12 +387,20 @@ class _Search:
         return quality.is_possible, quality.registered
 
     def quality(self, candidate: pycolmap.Reconstruction | None) -> _Quality:
-        """Tell whether a model can be right, whether it suffices, and how many photos it registered."""
+        """Tell whether a model can be right, whether it suffices, and how many photos it registered.
+
+        Where photos are added, those of the earlier model do not count for whether it suffices: they would hide that
+        none was added to many.
+        """
         if candidate is None:
             return _Quality(False, False, 0)
         count = candidate.num_reg_images()
+        num_before = 0
+        if self.before is not None:
+            num_before = self.before.num_reg_images()
         measures = measure(candidate)
-        is_enough = count >= _ENOUGH * len(self.names) and measures.stretch < 1 + _MOST_STRETCH
+        num_expected = len(self.names) - num_before
+        is_enough = count - num_before >= _ENOUGH * num_expected and measures.stretch < 1 + _MOST_STRETCH
         judgement = judge(measures)
         return _Quality(not judgement.faults, is_enough and judgement.is_sound, count)
 

@@ -160,7 +160,9 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")
     assert 10 <= int(checkpoint.stem[5:]) < 29
     assert main([*command, "--pipeline.effort", "2"]) == 2
-    assert "options of ns-train was --max-num-iterations 30" in capsys.readouterr().err
+    refusal = capsys.readouterr().err
+    assert "was stopped with other options (options of ns-train was --max-num-iterations 30" in refusal
+    assert f"give these to resume, or delete {folder.name}/training/sadgs to train anew on the same cameras." in refusal
 
     stop("splat.ply$")
     assert main(command) == 130
@@ -183,12 +185,8 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     lines = finish_again(command, folder, capsys)
     unread = run_unread(command)
     assert (unread.returncode, lines_of(unread.stderr).keys()) == (0, lines.keys()), unread.stderr
-    for changed, told in (
-        (["--effort", "2"], "--effort was 1.0, is 2.0"),
-        (["--max-size", "160"], "--max-size was 120, is 160"),
-    ):
-        assert main([*command[:7], *changed, *TRAINING]) == 2
-        assert f"({told}); give another --output or delete it." in capsys.readouterr().err
+    assert main([*command[:7], "--max-size", "160", *TRAINING]) == 2
+    assert "(--max-size was 120, is 160); give another --output or delete it." in capsys.readouterr().err
 
 
 @pytest.mark.hard_case(
@@ -493,7 +491,8 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
 
 
 @pytest.mark.hard_case(
-    "a folder that an earlier version of `sadgs` began", "nothing is done again; other options are refused, as ever"
+    "a folder that an earlier version of `sadgs` began",
+    "nothing is done again; with other options the scene is trained on anew",
 )
 def test_settings_that_an_earlier_version_wrote_are_read(
     photos: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
@@ -525,11 +524,51 @@ def test_settings_that_an_earlier_version_wrote_are_read(
     assert lines["training"] == "8 iterations, 3 Gaussians; done before"
     assert [words[0] for words in commands] == ["sadgs-export"] and checkpoint.exists()
     assert json.loads((out / "settings.json").read_text()).items() >= settings.items(), "that version reads it, too"
-    assert main([*command, "--effort", "1", *options]) == 2
-    assert "(--effort was 0.5, is 1.0); give another --output or delete it." in capsys.readouterr().err
-    assert main([*command, "--effort", "0.5"]) == 2
-    assert "(options of ns-train was --max-num-iterations 8, is none); give" in capsys.readouterr().err
+    commands.clear()
+    assert main([*command, "--effort", "1", *options]) == 0
+    assert [words[0] for words in commands] == ["ns-train", "sadgs-export"], "its cameras stay"
     assert "test_filenames" not in json.loads((out / "scene" / "transforms.json").read_text()), "its division stays"
+
+
+@pytest.mark.hard_case(
+    "`sadgs` with another effort or other options of training than the finished splat's",
+    "a run of its own is trained on the same cameras, the earlier splat is kept, and a line says so",
+)
+def test_a_draft_is_kept_where_another_effort_trains_anew_on_its_cameras(
+    scene: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
+):
+    out = tmp_path / "out"
+    runs = out / "training" / "sadgs"
+    command = [str(scene), "-o", str(out), "--formats", "ply"]
+    assert main([*command, "--effort", "0.1"]) == 0
+    (out / "splat.ply").write_text("draft")
+    commands.clear()
+    capsys.readouterr()
+
+    final = [*command, "--effort", "2"]
+    assert main(final) == 0
+    printed = capsys.readouterr().out
+    told = "Training begins anew on the same cameras (--effort was 0.1, is 2.0); the earlier splat is kept in "
+    assert f"{told}{out}/earlier/run.\n" in printed
+    training, export = commands
+    assert export[0] == "sadgs-export"
+    assert training[training.index("--pipeline.effort") + 1] == "2" and "--load-dir" not in training
+    (run,) = runs.iterdir()
+    assert training[training.index("--timestamp") + 1] == run.name != "run"
+    assert (out / "earlier" / "run" / "splat.ply").read_text() == "draft"
+    assert (out / "splat.ply").read_text() == ""
+
+    assert main(final) == 0
+    assert lines_of(capsys.readouterr().out)["training"].endswith("; done before")
+    assert main([*final, "--", "--max-num-iterations", "9"]) == 0
+    told = f"(options of ns-train was none, is --max-num-iterations 9); the earlier splat is kept in {out}/earlier/"
+    assert told + run.name in capsys.readouterr().out
+    assert len(list((out / "earlier").iterdir())) == 2 and len(list(runs.iterdir())) == 1
+
+    commands.clear()
+    assert main([*final, "--", "colmap", "--eval-mode", "all"]) == 2
+    assert "options of ns-train was --max-num-iterations 9, is colmap --eval-mode all); give" in capsys.readouterr().err
+    assert commands == [] and len(list((out / "earlier").iterdir())) == 2
 
 
 @pytest.mark.hard_case(

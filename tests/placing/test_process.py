@@ -246,6 +246,44 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
 
 
 @pytest.mark.hard_case(
+    "a photo that is added to many does not register at the first attempt",
+    "a second attempt with relaxed limits, as for a new scene; if it fails, too, another output folder is advised",
+)
+def test_photos_that_are_added_are_tried_again_however_many_there_are(
+    run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    shutil.copy(run.out / "work" / "database.db", tmp_path)
+    base = tmp_path / "base"
+    base.mkdir()
+    earlier = pycolmap.Reconstruction(run.out / "work" / "model")
+    earlier.deregister_frame(max(earlier.reg_frame_ids()))
+    earlier.write(base)
+    assert earlier.num_reg_images() == VIEWS - 1 >= 0.9 * VIEWS
+    mapping = pycolmap.incremental_mapping
+    angles: list[float] = []
+    failing = 1
+
+    def fail_at_first(*arguments: Any, **callbacks: Any) -> Any:
+        angles.append(arguments[3].mapper.init_min_tri_angle)
+        if len(angles) <= failing:
+            return {0: pycolmap.Reconstruction(base)}
+        return mapping(*arguments, **callbacks)
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", fail_at_first)
+    names = sorted(photo.name for photo in photos.iterdir())
+    reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", base)
+    assert angles == [8, 4]
+    assert pycolmap.Reconstruction(tmp_path / "model").num_reg_images() == VIEWS
+    told = (tmp_path / "model" / "attempts.txt").read_text()
+    assert told == f"A first attempt registered {VIEWS - 1}, one with relaxed limits {VIEWS}."
+
+    failing = 4
+    with pytest.raises(InputError, match="related to the others: give another output folder, for which all photos"):
+        reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "other", base)
+    assert angles == [8, 4, 8, 4] and not (tmp_path / "other").exists()
+
+
+@pytest.mark.hard_case(
     "all photos register with an angle of view that no lens has",
     "a second attempt; a model that can be right is kept, even with fewer photos",
 )
