@@ -503,7 +503,7 @@ def test_cameras_are_pinholes_or_undistorted_or_refused_by_name(
     "ValueError; a viewer's page must then be loaded again",
 )
 def test_rendering_a_camera_that_is_no_pinhole_is_refused():
-    with pytest.raises(ValueError, match="^Camera 0 of the path is EQUIRECTANGULAR, which sadgs cannot draw"):
+    with pytest.raises(ValueError, match=r"^Camera 0 of the path is EQUIRECTANGULAR, which sadgs cannot draw"):
         SadgsModel.get_outputs(None, cameras(CameraType.EQUIRECTANGULAR, None)[1:])  # type: ignore[arg-type]
 
 
