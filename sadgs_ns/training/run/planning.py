@@ -29,12 +29,12 @@ LEAST_PIXELS = 1.5e6
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 
 
-def decide_near_plane(config: SadgsModelConfig, of_scene: float, before: RunPlan | None) -> float:
+def decide_near_plane(config: SadgsModelConfig, of_scene: float | None, before: RunPlan | None) -> float:
     """Return the depth from which Gaussians are drawn.
 
     Args:
         config: The model's options. In runs of version 1.0.0 None stood for "scene".
-        of_scene: What `near_plane_of_scene` returned.
+        of_scene: What `near_plane_of_scene` returned. It is not needed with `before`.
         before: Plan of the checkpoint's run. Its depth is kept unless the option is a number.
     """
     option = config.near_plane
@@ -42,6 +42,7 @@ def decide_near_plane(config: SadgsModelConfig, of_scene: float, before: RunPlan
         return option
     if before is not None:
         return before.near_plane
+    assert of_scene is not None
     if option == "viewers":
         return min(NEAR_PLANE, of_scene)
     return of_scene

@@ -47,12 +47,15 @@ def prepare_run(config: SadgsTrainerConfig, pipeline: SadgsPipeline, world: Worl
     before = None
     if resumed is not None:
         before = resumed.plan
-    of_scene = near_plane_of_scene(pipeline)
+    of_scene = None
+    if before is None:  # It looks at every point in every view.
+        of_scene = near_plane_of_scene(pipeline)
     near_plane = decide_near_plane(pipeline.model.config, of_scene, before)
     if resumed is None:
         start_with_gains(pipeline, world)
     is_dense = start_from_stereo(pipeline, resumed=resumed is not None)
     if resumed is None:
+        assert of_scene is not None
         pipeline.clear_paths(of_scene)
     length = plan_length(config, len(pipeline.views), before)
     world, peers = choose_processes(config, pipeline, length, world, peers)
