@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.projection_forward import project_forward
-from sadgs_ns.kernels.shared import clamped, drawn, equally_spaced_rows, load3, rotation, store3
+from sadgs_ns.kernels.shared import clamped, drawn, equally_spaced_rows, load3, rotation, store3, unit_quaternion
 
 _LANES = 128  # Gaussians that one program handles
 
@@ -69,10 +69,7 @@ def _project_backward(
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     exists = g < n
     mean_x, mean_y, mean_z = load3(means, 3 * g, exists)
-    qw = tl.load(quats + 4 * g, exists, 1.0)
-    qx, qy, qz = load3(quats, 4 * g + 1, exists)
-    inverse_norm = 1 / tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    qw, qx, qy, qz = qw * inverse_norm, qx * inverse_norm, qy * inverse_norm, qz * inverse_norm
+    qw, qx, qy, qz, inverse_norm = unit_quaternion(quats, g, exists)
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
     sx, sy, sz = load3(scales, 3 * g, exists)
     m00, m01, m02 = r00 * sx, r01 * sy, r02 * sz  # M = R S, and Σ = M Mᵀ

@@ -21,7 +21,7 @@ from torch import Tensor
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import FAR_PLANE, NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import clamped, load3, rotation, store3
+from sadgs_ns.kernels.shared import clamped, load3, rotation, store3, unit_quaternion
 
 _LANES = 128  # Gaussians that one program handles
 _LARGEST = tl.constexpr(1e9)  # Radius in px that int32 holds
@@ -56,12 +56,8 @@ def _project_forward(
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     exists = g < n
     mean_x, mean_y, mean_z = load3(means, 3 * g, exists)
-    qw = tl.load(quats + 4 * g, exists, 1.0)
-    qx, qy, qz = load3(quats, 4 * g + 1, exists)
-    inverse_norm = 1 / tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(
-        qw * inverse_norm, qx * inverse_norm, qy * inverse_norm, qz * inverse_norm
-    )
+    qw, qx, qy, qz, _ = unit_quaternion(quats, g, exists)
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
     s0, s1, s2 = load3(scales, 3 * g, exists)
     extent = _EXTENT
     if PER_GAUSSIAN == 2:  # The distance in standard deviations at which alpha falls below 1/255

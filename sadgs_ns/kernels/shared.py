@@ -45,6 +45,15 @@ def rotation(w, x, y, z):
 
 
 @triton.jit
+def unit_quaternion(quats, at, exists):
+    """Load the quaternion at index `at` in N, and return it with a length of 1, and one over its length."""
+    w = tl.load(quats + 4 * at, exists, 1.0)
+    x, y, z = load3(quats, 4 * at + 1, exists)
+    inverse_norm = 1 / tl.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm, inverse_norm
+
+
+@triton.jit
 def clamped(ratio, focal, centre, size):
     """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
     margin = 0.15 * size / focal

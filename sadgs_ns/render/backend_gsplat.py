@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sadgs_ns import gsplat_compat
+from sadgs_ns.render.ewa import view_directions
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
@@ -39,16 +40,13 @@ def colors_in_views(
 ) -> Tensor:
     """Return colours as cameras see them [C, N, D], computed where Gaussians are drawn."""
     num_views = len(viewmats)
-    colors = gaussians.colors
-    if isinstance(colors, tuple):
-        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    colors = gaussians.joined_colors()
     if sh_degree is None:
         return colors.expand(num_views, -1, -1)
-    # gsplat inverts the matrices, which makes the host wait for the device.
-    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
+    directions = view_directions(gaussians.means, viewmats)
     coefficients = colors.expand(num_views, -1, -1, -1)
     drawn = gsplat_compat.drawn(radii, means2d)
-    colors = gsplat.spherical_harmonics(sh_degree, gaussians.means - positions, coefficients, masks=drawn)
+    colors = gsplat.spherical_harmonics(sh_degree, directions, coefficients, masks=drawn)
     return torch.clamp_min(colors + 0.5, 0.0)
 
 

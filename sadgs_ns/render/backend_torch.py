@@ -51,9 +51,8 @@ class _Segment(NamedTuple):
 
 def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begin_tiles: bool = True) -> Projected:
     """Do what `rasterization.project` says; differentiable by all but `Ks`."""
-    means, quats, scales, opacities, colors = gaussians
-    if isinstance(colors, tuple):
-        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    means, quats, scales, opacities, _ = gaussians
+    colors = gaussians.joined_colors()
     viewmats, Ks, width, height = cameras
     C = len(viewmats)
     N = len(means)

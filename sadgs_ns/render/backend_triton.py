@@ -14,7 +14,7 @@ from sadgs_ns.kernels.harmonics import MAX_DEGREE, colors_from_harmonics
 from sadgs_ns.kernels.limits import check_gaussians, check_pixels
 from sadgs_ns.kernels.tiles import intersect_tiles
 from sadgs_ns.render.backend_gsplat import opacities_in_views
-from sadgs_ns.render.ewa import spherical_harmonics
+from sadgs_ns.render.ewa import spherical_harmonics, view_directions
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
 
@@ -52,17 +52,14 @@ def _colors_in_views(gaussians: Gaussians, viewmats: Tensor, sh_degree: int | No
     [C, N, D]
     """
     num_views = len(viewmats)
-    colors = gaussians.colors
-    if isinstance(colors, tuple):
-        colors = torch.cat([colors[0][:, None], colors[1]], dim=1)
+    colors = gaussians.joined_colors()
     if sh_degree is None:
         return colors.expand(num_views, -1, -1)
     if sh_degree > MAX_DEGREE:
         raise InputError(
             f"The backend triton draws spherical harmonics up to degree {MAX_DEGREE}, and these have {sh_degree}."
         )
-    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
-    directions = gaussians.means - positions
+    directions = view_directions(gaussians.means, viewmats)
     coefficients = colors.expand(num_views, -1, -1, -1)
     return torch.clamp_min(spherical_harmonics(sh_degree, directions, coefficients) + 0.5, 0.0)
 

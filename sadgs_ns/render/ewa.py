@@ -56,6 +56,18 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     return means2d / z[..., None], covars2d
 
 
+def view_directions(
+    means: Tensor,  # [N, 3]
+    viewmats: Tensor,  # rigid [C, 4, 4]
+) -> Tensor:
+    """Return the vectors from cameras to positions. [C, N, 3]
+
+    They need no inverse of a matrix, for which the host would wait for the device.
+    """
+    positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
+    return means - positions
+
+
 def spherical_harmonics(degree: int, dirs: Tensor, coeffs: Tensor) -> Tensor:
     """Evaluate harmonics up to a degree ≤ 3, in 3DGS's order, without a colour's 0.5. […, 3]
 

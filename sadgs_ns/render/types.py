@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import torch
 from torch import Tensor
 
 from sadgs_ns.gsplat_compat import NEAR_PLANE
@@ -29,6 +30,12 @@ class Gaussians(NamedTuple):
     colors: Tensor | tuple[Tensor, Tensor]
     """With `RenderOptions.sh_degree`, coefficients of spherical harmonics: [(C,) N, K, 3], or the pair of those of
     degree 0 [N, 3] and of the others [N, K − 1, 3]. Otherwise D features of any kind [(C,) N, D]."""
+
+    def joined_colors(self) -> Tensor:
+        """Return the colours as one tensor, coefficients of all degrees [N, K, 3] if they are a pair."""
+        if isinstance(self.colors, tuple):
+            return torch.cat([self.colors[0][:, None], self.colors[1]], dim=1)
+        return self.colors
 
 
 class Cameras(NamedTuple):

@@ -92,7 +92,7 @@ class AdamUpdate:
         from sadgs_ns.kernels.adam import rate_and_scale
 
         columns = []
-        for (name, group), state in zip(zip(self.parameters, self._groups, strict=True), self._states, strict=True):
+        for name, group, state in zip(self.parameters, self._groups, self._states, strict=True):
             if name in self._tables:  # The device counts the updates of each row.
                 columns.append((group["lr"], 1.0))
                 continue
