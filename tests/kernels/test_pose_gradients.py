@@ -76,16 +76,25 @@ def differentiate(projected: Projected, seen: Tensor, names: tuple[str, ...]) ->
     torch.autograd.backward(outputs, gradients)
 
 
-@pytest.mark.parametrize("names", [OUTPUTS, ("means2d", "conics"), ("conics",), ("colors",)], ids="-".join)
-@pytest.mark.parametrize("num_views", [1, 3])
-def test_gradients_by_the_cameras_equal_float64_autograd(num_views: int, names: tuple[str, ...]):
-    values = scene(num_views)
+def project_exactly_and_fast(values: dict[str, Any]) -> tuple[Any, Any, Projected, Projected, Tensor]:
+    """Project a scene in float64 by torch, and by the kernels.
+
+    Returns the inputs of both, what both project, and what both draw, bool [C, N].
+    """
     exact = inputs_of(values, poses=True)
     fast = inputs_of({name: value.float().to(DEVICE) for name, value in values.items()}, poses=True)
     expected = project(backend_torch, exact)
     found = project(backend_triton, fast)
     seen = gsplat_compat.drawn(expected.radii, expected.means2d)
     seen &= gsplat_compat.drawn(found.radii, found.means2d).cpu()
+    return exact, fast, expected, found, seen
+
+
+@pytest.mark.parametrize("names", [OUTPUTS, ("means2d", "conics"), ("conics",), ("colors",)], ids="-".join)
+@pytest.mark.parametrize("num_views", [1, 3])
+def test_gradients_by_the_cameras_equal_float64_autograd(num_views: int, names: tuple[str, ...]):
+    values = scene(num_views)
+    exact, fast, expected, found, seen = project_exactly_and_fast(values)
     assert 0.3 < seen.float().mean() < 0.95
     differentiate(expected, seen, names)
     differentiate(found, seen, names)
@@ -114,13 +123,7 @@ def tangent(gradient: Tensor, viewmats: Tensor) -> Tensor:
 
 
 def test_projection_s_gradients_by_each_entry_of_a_matrix_equal_float64_autograd():
-    values = scene(2)
-    exact = inputs_of(values, poses=True)
-    fast = inputs_of({name: value.float().to(DEVICE) for name, value in values.items()}, poses=True)
-    expected = project(backend_torch, exact)
-    found = project(backend_triton, fast)
-    seen = gsplat_compat.drawn(expected.radii, expected.means2d)
-    seen &= gsplat_compat.drawn(found.radii, found.means2d).cpu()
+    exact, fast, expected, found, seen = project_exactly_and_fast(scene(2))
     for projected in (expected, found):
         differentiate(projected, seen, ("means2d", "conics", "depths"))
     reference = exact["viewmats"].grad
