@@ -1,10 +1,12 @@
-"""Gaussians for tests of what is written of them."""
+"""Gaussians and cameras that tests draw at random."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sadgs_ns.formats.gaussians import Gaussians, of_parameters
 
@@ -23,3 +25,16 @@ def random_gaussians(count: int, bands: int = 15, seed: int = 0) -> Gaussians:
         "features_rest": generator.normal(0, 0.1, (count, bands, 3)),
     }
     return of_parameters(arrays)
+
+
+def nearly_aligned_viewmats(num_views: int, generator: torch.Generator) -> Tensor:
+    """Matrices of cameras near the origin that look about along z, in float64. [C, 4, 4]"""
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(num_views, 1, 1)
+    viewmats[:, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1 * random(num_views, 3, 3))[0]
+    viewmats[:, :3, :3] *= viewmats[:, :3, :3].diagonal(dim1=1, dim2=2).sign()[:, None]
+    viewmats[:, :3, 3] = 0.2 * random(num_views, 3)
+    return viewmats

@@ -11,6 +11,7 @@ import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
 
+from helpers.random_gaussians import nearly_aligned_viewmats
 from sadgs_ns import gsplat_compat
 
 projection = pytest.importorskip("sadgs_ns.kernels.projection", reason="Triton is not installed")
@@ -28,10 +29,7 @@ def scene(num_views: int) -> dict[str, Any]:
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(num_views, 1, 1)
-    viewmats[:, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1 * random(num_views, 3, 3))[0]
-    viewmats[:, :3, :3] *= viewmats[:, :3, :3].diagonal(dim1=1, dim2=2).sign()[:, None]
-    viewmats[:, :3, 3] = 0.2 * random(num_views, 3)
+    viewmats = nearly_aligned_viewmats(num_views, generator)
     K = torch.tensor([[35.0, 0.0, 19.0], [0.0, 45.0, 16.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     means = random(N, 3) * torch.tensor([2.0, 2.0, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
     means[::10, 2] = -1.0

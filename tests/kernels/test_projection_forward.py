@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from helpers import gsplat_stub
+from helpers.random_gaussians import nearly_aligned_viewmats
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import backend_torch
 
@@ -31,10 +32,7 @@ def random_scene(num_views: int) -> Scene:
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
 
-    viewmats = torch.eye(4, dtype=torch.float64).repeat(num_views, 1, 1)
-    viewmats[:, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.1 * random(num_views, 3, 3))[0]
-    viewmats[:, :3, :3] *= viewmats[:, :3, :3].diagonal(dim1=1, dim2=2).sign()[:, None]
-    viewmats[:, :3, 3] = 0.2 * random(num_views, 3)
+    viewmats = nearly_aligned_viewmats(num_views, generator)
     opacities = torch.rand((N,), generator=generator, dtype=torch.float64)
     opacities[::7] = 0.002  # less than 1/255
     means = random(N, 3) * torch.tensor([1.5, 1.5, 1.0]) + torch.tensor([0.0, 0.0, 3.0])
