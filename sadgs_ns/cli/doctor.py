@@ -24,6 +24,7 @@ from sadgs_ns.cli.program import parse
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import Finding, fault, note, warning
 from sadgs_ns.errors import free_space, reason
+from sadgs_ns.formats import page_writer
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
 _LPIPS_FILE = "alexnet-owt-7be5be79.pth"  # The file in which torchvision keeps the weights of LPIPS's AlexNet
@@ -33,8 +34,8 @@ _NEEDED = (  # A program or library, its names, what needs it, and the remedy
     ("C compiler", "gcc clang", "Triton compiles with it; install the packages gcc and python3-dev"),
     ("ffmpeg", "ffmpeg", "`ns-render` needs it (not for `dataset`), `ns-process-data` too; install the package ffmpeg"),
     ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
-    ("Node.js", "npm", "pages (.html) are written by a program for it; install version 22 or newer from nodejs.org"),
 )
+_PAGES = "pages (.html) are written by a program for it"
 
 
 def versions() -> dict[str, str]:
@@ -84,6 +85,22 @@ def check_machine() -> Iterator[Finding]:
             yield note(f"{program} is missing: {use}.")
         else:
             yield warning(f"{program} is missing: {use}.")
+    yield _check_node()
+
+
+def _check_node() -> Finding:
+    """Check the version of Node.js, and that npm is there."""
+    remedy = f"{_PAGES}; install {page_writer.NEEDED_NODE} from nodejs.org"
+    found = page_writer.node_version()
+    if found is None:
+        return warning(f"Node.js is missing: {remedy}.")
+    version = ".".join(map(str, found))
+    if found < page_writer.OLDEST_NODE:
+        return warning(f"Node.js {version} is too old: {remedy}.")
+    npm = _find_program(["npm"])
+    if npm is None:
+        return warning(f"Node.js {version} is here without npm: {remedy}.")
+    return note(f"Node.js: {version}, with {npm}.")
 
 
 def _check_user() -> Iterator[Finding]:

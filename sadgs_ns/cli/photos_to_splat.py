@@ -34,6 +34,7 @@ class PhotosToSplat:
         train_options: The options for ns-train.
         console: Where the lines of the stages are printed.
         source: The photos or the video.
+        title: The title of the page, which is the source's name.
         folder: The folder for all results.
         results: The same folder, with its settings.
         formats: The formats to export, in this order.
@@ -49,6 +50,7 @@ class PhotosToSplat:
         self.train_options = train_options
         self.console = console
         self.source = options.source
+        self.title = _name_of(options.source)
         self.folder = options.output or _default_folder(options.source)
         self.results = SadgsFolder(self.folder)
         self.formats = choose_formats(options.formats, options.measure, console)
@@ -158,8 +160,13 @@ class PhotosToSplat:
 
 def _default_folder(source: Path) -> Path:
     """Name the folder for the results after the source, in the working directory."""
+    return Path(f"{_name_of(source)}-splat")
+
+
+def _name_of(source: Path) -> str:
+    """Return the name of photos' folder, or of a video without its suffix."""
     real = Path(os.path.realpath(source))
     name = real.stem
     if real.is_dir():
         name = real.name
-    return Path(f"{name or 'photos'}-splat")
+    return name or "photos"

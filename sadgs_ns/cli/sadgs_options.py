@@ -65,7 +65,7 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     has_node = page_writer.has_node()
     if requested is None:
         if not has_node:
-            console.print("Node.js (22 or newer) is not installed, without which no page is made: a PLY is.")
+            console.print(f"{page_writer.NEEDED_NODE} is not installed, without which no page is made: a PLY is.")
             return ["ply"]
         if page_writer.is_installed() or _may_download(console):
             return ["ply", "html"]
@@ -76,7 +76,7 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     if unknown:
         raise InputError(f"--formats knows {', '.join(FORMAT_NAMES)}, and not {unknown[0]!r}.")
     if "html" in formats and not has_node:
-        raise InputError("a page is made with the help of Node.js: install version 22 or newer, or leave html out.")
+        raise InputError(f"a page needs {page_writer.NEEDED_NODE}, with npm: install it, or leave html out.")
     if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
     if measure and "ply" not in formats:

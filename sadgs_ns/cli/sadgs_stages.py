@@ -183,8 +183,11 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
         if _is_current(work, output):
             progress.finished.append(f"{output}; done before")
         else:
+            title = None
+            if name == "html":
+                title = work.title
             # The folder may have been renamed since config.yml noted where the scene is.
-            jobs.append(Export(work.results.run, output, data=work.data))
+            jobs.append(Export(work.results.run, output, data=work.data, title=title))
     for name in FORMAT_NAMES:
         output = work.results.splat(name)
         if name not in work.formats and output.is_file() and not _is_current(work, output):

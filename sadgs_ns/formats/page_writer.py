@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import subprocess
 import tempfile
@@ -20,12 +21,32 @@ PACKAGES = Path(__file__).parent / "npm"
 PROGRAM = Path("node_modules/@playcanvas/splat-transform/bin/cli.mjs")
 DOWNLOAD = "PlayCanvas's splat-transform with the packages that it needs, 215 MB"
 """What is downloaded, for sentences to users."""
-REMEDY = "install Node.js 22 or newer, be online the first time, or choose another format"
+OLDEST_NODE = (18, 20)
+"""Oldest tested version that makes a page: 18.20, 20.0 and 20.20 do, and 18.3 fails. The program asks for 22."""
+NEEDED_NODE = "Node.js {}.{} or newer".format(*OLDEST_NODE)
+REMEDY = f"install {NEEDED_NODE}, be online the first time, or choose another format"
 _SECONDS = 300  # Longest time of the download, and of making a page
 
 
+def node_version() -> tuple[int, ...] | None:
+    """Return the version of the Node.js that is installed, such as (20, 11, 1); None if there is none that runs."""
+    try:
+        told = subprocess.run(["node", "--version"], check=True, capture_output=True, text=True, timeout=_SECONDS)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    found = re.match(r"v(\d+)\.(\d+)\.(\d+)", told.stdout)
+    if found is None:
+        return None
+    return tuple(int(part) for part in found.groups())
+
+
 def has_node() -> bool:
-    """Tell whether Node.js is installed, with npm."""
+    """Tell whether Node.js is installed, with npm, in a version that makes pages."""
+    version = node_version()
+    return _has_programs() and version is not None and version >= OLDEST_NODE
+
+
+def _has_programs() -> bool:
     return shutil.which("node") is not None and shutil.which("npm") is not None
 
 
@@ -46,8 +67,9 @@ def install() -> None:
     """Download the program, unless it is there; raise InputError if that fails, and leave nothing half done."""
     if is_installed():
         return
-    if not has_node():
-        raise InputError(f"HTML is written with the help of Node.js, whose node and npm are not there: {REMEDY}.")
+    if not _has_programs():
+        problem = "HTML is written with the help of Node.js, whose node and npm are not there"
+        raise InputError(f"{problem}: {REMEDY}.")
     target = folder()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -255,7 +255,6 @@ def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, mon
         ("C compiler", "clang", "warning", "Triton compiles with it", "the packages gcc and python3-dev"),
         ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it (not for `dataset`)", "the package ffmpeg"),
         ("libusb-1.0", "usb-1.0", "warning", "`ns-export`, `ns-process-data` and meshes", "the package libusb-1.0-0"),
-        ("Node.js", "npm", "warning", "pages (.html)", "version 22 or newer from nodejs.org"),
     ],
 )
 def test_programs_are_looked_for_and_their_use_is_told(
@@ -268,6 +267,33 @@ def test_programs_are_looked_for_and_their_use_is_told(
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
     told, sentence = about(f"{program} is missing: ")
     assert (told, need in sentence) == (severity, True) and sentence.endswith(f"; install {remedy}.")
+
+
+@pytest.mark.parametrize(
+    ("told", "npm", "sentence"),
+    [
+        ("v20.11.1", "/there/npm", "note: Node.js: 20.11.1, with /there/npm."),
+        ("v20.11.1", None, "warning: Node.js 20.11.1 is here without npm: pages"),
+        (
+            "v18.3.0",
+            "/there/npm",
+            "warning: Node.js 18.3.0 is too old: pages (.html) are written by a program for it; ",
+        ),
+        ("what?", "/there/npm", "warning: Node.js is missing: pages (.html) are written by a program for it; "),
+        (None, "/there/npm", "warning: Node.js is missing: pages (.html) are written by a program for it; "),
+    ],
+)
+def test_the_version_of_node_is_told(
+    told: str | None, npm: str | None, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    if told is not None:
+        (tmp_path / "node").write_text(f"#!/bin/sh\necho '{told}'\n")
+        (tmp_path / "node").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(doctor, "_find_program", lambda names: npm)
+    found = doctor._check_node()
+    assert f"{found.severity}: {found.sentence}".startswith(sentence)
+    assert found.severity == "note" or found.sentence.endswith("; install Node.js 18.20 or newer from nodejs.org.")
 
 
 @pytest.mark.hard_case("`sadgs-doctor` in an environment with `SADGS_TRITON=0`", "a warning names the variable")

@@ -81,7 +81,7 @@ def make_a_page_without_network(folder: Path, monkeypatch: pytest.MonkeyPatch) -
     """Put programs in the place of Node.js and npm that make a page without a viewer."""
     page = '<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
     programs = {
-        "node": f"for file; do :; done\necho '{page}' > \"$file\"\n",
+        "node": f"[ $1 = --version ] && exec echo v20.0.0\nfor file; do :; done\necho '{page}' > \"$file\"\n",
         "npm": f"mkdir -p {page_writer.PROGRAM.parent}\ntouch {page_writer.PROGRAM}\n",
     }
     folder.mkdir()
@@ -404,7 +404,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "-o", "others/letter.txt"], "others/letter.txt exists and is not a folder"),
         ([source, "-o", "damaged"], "damaged/settings.json is damaged (Expecting property name"),
         ([source, "--", "--load-dir=x"], "--load-dir is set by sadgs itself: leave it out, or use ns-train."),
-        ([source, "--formats", "html,ply"], "a page is made with the help of Node.js: install version 22 or newer"),
+        ([source, "--formats", "html,ply"], "a page needs Node.js 18.20 or newer, with npm: install it"),
         (
             [source, "--formats", "ply,splat"],
             "--formats knows ply, compressed.ply, spz, sog, glb, html, mesh.ply, and not 'splat'",
