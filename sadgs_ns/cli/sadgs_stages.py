@@ -76,6 +76,8 @@ def _explain_poor(found: str, summary: Summary, command: list[str]) -> str:
     else:
         problem = f"only {found}, so the splat would show only what these saw: "
         remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
+    if summary.larger_photos:
+        remedies = f"begin another --output with {summary.larger_photos}; "
     if summary.matching != "exhaustive":
         exhaustive = shlex.join([*command, "--matching", "exhaustive"])
         remedies += f"or compare more pairs of them with `{exhaustive}`, and run this command again; "

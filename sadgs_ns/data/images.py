@@ -109,6 +109,10 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
     return False
 
 
+SMALL_PHOTO = 640
+"""Longest side in px below which a photo shows few features; those of phones have 3,000 and more."""
+
+
 def image_size(path: Path) -> Size:
     """Return width and height in px, or zeros if they cannot be read."""
     return read_header(path).size

@@ -81,8 +81,25 @@ def _visible_files(folder: Path) -> list[str]:
     """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them.
 
     Folders that cannot be read are among them. Links to folders are followed, unless they lead to what is read anyway.
+    Git repositories, results and runs in the folder are not looked into.
     """
+    return _walk(folder)[0]
+
+
+def is_result(folder: Path) -> bool:
+    """Tell whether `sadgs` made a folder."""
+    return (folder / "settings.json").is_file() and ((folder / "training").is_dir() or (folder / "log").is_dir())
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Tell whether a folder is a git repository, a result of `sadgs`, or a run of nerfstudio."""
+    return (folder / ".git").exists() or is_result(folder) or (folder / "nerfstudio_models").is_dir()
+
+
+def _walk(folder: Path) -> tuple[list[str], list[str]]:
+    """Return the names of visible files in a folder, and of the folders in it that are not looked into, both sorted."""
     paths = list[Path]()
+    foreign = list[Path]()
     unread = list[OSError]()
     top = Path(os.path.realpath(folder))
     seen = {top, *top.parents}
@@ -90,11 +107,15 @@ def _visible_files(folder: Path) -> list[str]:
         paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
         real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
         inner = {name for name in folders if Path(parent, name).is_symlink() and top in real[name].parents}
-        folders[:] = [name for name in folders if real[name] not in seen and name not in inner]
+        entered = [name for name in folders if real[name] not in seen and name not in inner]
+        others = [name for name in entered if _is_foreign(Path(parent, name))]
+        foreign += (Path(parent, name) for name in others)
+        folders[:] = [name for name in entered if name not in others]
         seen |= {real[name] for name in folders}
     paths += (Path(error.filename) for error in unread)
     names = (path.relative_to(folder).as_posix() for path in sorted(paths))
-    return [name for name in names if "/." not in f"/{name}"]
+    left = (path.relative_to(folder).as_posix() for path in sorted(foreign))
+    return [name for name in names if "/." not in f"/{name}"], [name for name in left if "/." not in f"/{name}"]
 
 
 def images_of(cameras: Path, folder: Path) -> list[str]:
@@ -127,7 +148,7 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         pi_heif.register_heif_opener()  # Pillow then reads HEIC, but not where poses are given: training would not.
     folder = Path(os.path.realpath(source))
     scene = Path(os.path.realpath(out))
-    files = _visible_files(folder)
+    files, foreign = _walk(folder)
     settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
     scenes = {scene, *(path.parents[1] for path in settings)}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
@@ -159,6 +180,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
             masks.setdefault(max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")})), name)
         else:
             found["masks of no photo"].append(name)
+    own = {scene, *scene.parents}
+    found["repositories or results of other work"] = [name for name in foreign if folder / name not in own]
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
     return photos, masks, [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
 

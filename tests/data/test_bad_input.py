@@ -348,7 +348,7 @@ COLMAP = {
     # poses
     "model-loop": (
         link_to_itself(SPARSE),
-        r"\S+ holds 10 images but no camera poses: compute them with .*\.",
+        r"\S+ holds 10 images but no camera poses: `sadgs .*\.",
     ),
     "poses-loop": (
         link_to_itself(f"{SPARSE}/images.bin"),
@@ -356,7 +356,8 @@ COLMAP = {
     ),
     "no-poses": (
         remove("sparse"),
-        r"\S+ holds 10 images but no camera poses: compute them with `sadgs-process \S+/images FOLDER`\.",
+        r"\S+ holds 10 images but no camera poses: `sadgs \S+/images` makes a splat of them, and "
+        r"`sadgs-process \S+/images FOLDER` computes the poses alone; photos of \d+ px show few features, so give them in their original size\.",
     ),
     "no-images": (
         model(lambda cameras, images, points: images.clear()),
@@ -531,7 +532,7 @@ NERFSTUDIO = {
     ),
     "json-loop": (
         link_to_itself("transforms.json"),
-        r"\S+ holds 10 images but no camera poses: compute them with .*\.",
+        r"\S+ holds 10 images but no camera poses: `sadgs .*\.",
     ),
     "json-mask-loop": (
         lambda data: (mask("L", 255)(data), link_to_itself("mask.png")(data)),
@@ -709,7 +710,7 @@ CASES = {
 @pytest.mark.hard_case("no images: an empty reconstruction, no frames", "refused", "no-images", "json-no-frames")
 @pytest.mark.hard_case(
     "images without any pose",
-    "refused: counts them, and gives the command `sadgs-process` with the photos' folder in it",
+    "refused: counts them, gives the commands `sadgs` and `sadgs-process` with their folder, and tells small photos",
     "no-poses",
     "json-missing",
 )

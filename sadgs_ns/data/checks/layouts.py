@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.images import VIDEO_SUFFIXES, images_in
+from sadgs_ns.data.images import SMALL_PHOTO, VIDEO_SUFFIXES, image_size, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
 from sadgs_ns.data.transforms import GIVE_POSES
 
@@ -92,8 +93,7 @@ def no_layout(data: Path) -> str:
         photos = data / "images"
         images = images_in(photos)
     if images:
-        command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
-        return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
+        return f"{data} holds {len(images)} images but no camera poses: {_remedy_for_photos(photos, images)}."
     capture = _capture_inside(data)
     if capture is not None:
         return f"{data} is no capture, but {capture} in it is one: give --data that folder."
@@ -101,6 +101,16 @@ def no_layout(data: Path) -> str:
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _remedy_for_photos(folder: Path, images: Sequence[Path]) -> str:
+    """Return the commands for a folder of photos without poses, and what is against these photos."""
+    quoted = shlex.quote(str(folder))
+    remedy = f"`sadgs {quoted}` makes a splat of them, and `sadgs-process {quoted} FOLDER` computes the poses alone"
+    longest = max(image_size(images[len(images) // 2]))
+    if 0 < longest < SMALL_PHOTO:
+        remedy += f"; photos of {longest} px show few features, so give them in their original size"
+    return remedy
 
 
 def _no_folder(data: Path) -> str:
