@@ -97,6 +97,9 @@ class SadgsModelConfig(InstantiateConfig):
     """Side of the cube around the origin in which random points are drawn, in the run's units."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
+    starts_per_pixel: Hidden[float] = 0.02
+    """Most points to start from for each pixel of all training images, which only small images reach.
+    A hundredth of them may lie on the bounding box; 0 sets no limit, as in the paper."""
     stereo_points: int | None = None
     """Largest number of points that are drawn from stereo depth of the training photos and added to the start (CUDA).
     None is 150,000 if there are 3 to 60 training views, and otherwise 0."""
@@ -153,6 +156,7 @@ class SadgsModelConfig(InstantiateConfig):
             ("near_plane", is_near_plane, "viewers, scene, or positive and finite"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
             ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
+            ("starts_per_pixel", 0 <= self.starts_per_pixel < math.inf, "finite and not negative"),
             ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
             ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
         ]

@@ -24,6 +24,9 @@ from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.step.images import LazyImages, thread_count
 
+NUM_PIXELS = "num_pixels"
+"""Key of the number of all training images' pixels in the metadata that the model gets."""
+
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     """Loads images in threads or on demand. Raises InputError for wrong names or sizes."""
@@ -41,6 +44,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         config.cache_images = "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = requested
+        cameras = self.train_dataset.cameras
+        self.train_dataset.metadata[NUM_PIXELS] = int((cameras.width * cameras.height).sum())
         for dataset in (self.train_dataset, self.eval_dataset):
             _make_paths(dataset)
             splits.check_paths(dataset.image_filenames)

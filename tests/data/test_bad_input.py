@@ -357,7 +357,8 @@ COLMAP = {
     "no-poses": (
         remove("sparse"),
         r"\S+ holds 10 images but no camera poses: `sadgs \S+/images` makes a splat of them, and "
-        r"`sadgs-process \S+/images FOLDER` computes the poses alone; photos of \d+ px show few features, so give them in their original size\.",
+        r"`sadgs-process \S+/images FOLDER` computes the poses alone; "
+        r"photos of \d+ px show few features, so give them in their original size\.",
     ),
     "no-images": (
         model(lambda cameras, images, points: images.clear()),

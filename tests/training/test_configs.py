@@ -273,6 +273,28 @@ def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_th
     assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
 
 
+def test_small_images_bound_the_number_of_starting_points(capsys: pytest.CaptureFixture[str]):
+    """Of 100,000 pixels 2 % are 2,000 points, and the box has the least, 2 × 2 a face; a billion bound nothing."""
+    generator = torch.Generator().manual_seed(0)
+    seed_points = torch.rand((3000, 3), generator=generator), 255 * torch.rand((3000, 3), generator=generator)
+
+    def number(pixels: int | None, **options: Any) -> int:
+        config = dataclasses.replace(SadgsModelConfig(), **options)
+        params, synthetic = initial_gaussians.initial_gaussians(config, seed_points, pixels)
+        assert len(synthetic) == len(params["means"])
+        return len(synthetic)
+
+    assert number(100_000) == 2000 + 6 * 2**2
+    assert "Starting from a random 2,000 of 3,000 SfM points, as all training images have 100,000 px" in (
+        " ".join(capsys.readouterr().out.split()).replace("pixels", "px")
+    )
+    assert number(100_000, random_init=True) == 2000
+    everything = 3000 + 6 * 16**2
+    assert number(10**9) == number(None) == number(100_000, starts_per_pixel=0.0) == everything
+    assert number(10**9, random_init=True) == 50_000
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.hard_case(
     "`sh-degree` 9, `num-random` 10⁹ or `random-scale` out of range; `opacity-reg` ∞ or 10⁹",
     "refused by name",
@@ -415,7 +437,7 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
     model.averaged_share = model.max_angular_scale = 0.0
     model.near_plane = "scene"
-    model.stereo_points, model.clear_paths = 0, False
+    model.stereo_points, model.starts_per_pixel, model.clear_paths = 0, 0.0, False
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
     model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900
