@@ -1240,6 +1240,7 @@ def test_a_wild_point_does_not_change_what_training_starts_from(
     def start(data: Path) -> dict[str, Tensor]:
         config = configure(tmp_path / "out", parser_of(data), iterations=1)
         config.pipeline.model.bounding_box_points = True
+        config.pipeline.model.starts_per_pixel = 0.0  # All points on the box, as with larger images
         config.pipeline.model.stereo_points = 0  # They would come last on a GPU.
         model = set_up(config).pipeline.model
         return {name: model.gauss_params[name].detach() for name in ("means", "scales", "opacities")}
