@@ -8,6 +8,7 @@ from pathlib import Path
 from sadgs_ns.data import colmap
 from sadgs_ns.data.images import VIDEO_SUFFIXES, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
+from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.transforms import GIVE_POSES
 
 _BUNDLER = (
@@ -81,8 +82,7 @@ def no_layout(data: Path) -> str:
         return f"{data} is a part of the capture {capture}: give --data that folder."
     kind = colmap.model_kind(data)
     if kind is not None:
-        first = colmap.image_names(data)[:1]
-        return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
+        return _no_images(data, data / f"images.{kind}")
     elsewhere = poses_elsewhere(data)
     if elsewhere is not None:
         return elsewhere
@@ -101,6 +101,16 @@ def no_layout(data: Path) -> str:
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _no_images(data: Path, poses: Path) -> str:
+    """Return the sentence for a folder with a reconstruction, without the images of its poses."""
+    names = colmap.image_names(data)
+    for name in names[:1]:
+        found = NearbyFiles(data).sentence(data / name)
+        if found is not None:
+            return f"{poses} has poses, but its image {data / name} {found}."
+    return f"{poses} has poses, but its images, such as {names[:1]}, are not in {data}: put them there."
 
 
 def _no_folder(data: Path) -> str:
