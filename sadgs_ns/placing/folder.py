@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.data.images import IMAGE_SUFFIXES, UNREADABLE, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES, image_size
+from sadgs_ns.data.images import (
+    IMAGE_SUFFIXES,
+    UNREAD_SUFFIXES,
+    UNREADABLE,
+    UNSTITCHED_SUFFIXES,
+    VIDEO_SUFFIXES,
+    image_size,
+)
 from sadgs_ns.data.layouts import automatic_options
 from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
@@ -27,8 +34,6 @@ _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _LONGEST_NAME = 255 - len(".jpg.png")  # Bytes of a name to which a conversion and its mask add these suffixes
 _UNSTITCHED = "files of 360° cameras (stitch them to panoramas or films of 2:1 with the camera's program)"
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
-_RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-"""Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
@@ -201,7 +206,7 @@ def _kind(path: Path) -> str:
         return "photos"
     with contextlib.suppress(*UNREADABLE), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
         kind = image.format
-    if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
+    if suffix not in IMAGE_SUFFIXES | UNREAD_SUFFIXES:
         return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
     return "photos" if kind in _FORMATS - {"TIFF"} else _NOT_READ
 
@@ -209,7 +214,7 @@ def _kind(path: Path) -> str:
 def _stem(name: str) -> str:
     """Return the part of a photo's name that its mask and copies share."""
     stem = Path(_VARIANT.sub("", Path(name).stem.lower()))
-    return stem.stem if stem.suffix in IMAGE_SUFFIXES | _RAW_OR_HEIC else stem.name
+    return stem.stem if stem.suffix in IMAGE_SUFFIXES | UNREAD_SUFFIXES else stem.name
 
 
 def _is_mask(path: Path) -> bool:

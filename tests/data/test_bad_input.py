@@ -504,10 +504,6 @@ NERFSTUDIO = {
     "json-one-view": (meta(keep(1)), r"\S+ has 1 view, which shows no depth: take at least 2 images, .*\."),
     "json-size": (picture(FIRST, (36, 48)), r"\S+/000\.png has 36 × 48 px, but its camera in \S+ 48 × 36: .*"),
     "json-image-missing": (remove("images/004.png"), r"\S+/images/004\.png does not exist: .*"),
-    "json-some-masks": (
-        meta(lambda m: m["frames"][0].update(mask_path="images/001.png")),
-        r"\S+ names masks for 1 of 10 frames: give all of them one, or none\.",
-    ),
     "json-mask-size": (
         lambda data: (
             picture("mask.png", (10, 10), "L")(data),
@@ -734,9 +730,7 @@ CASES = {
 @pytest.mark.hard_case(
     "an image of another size than its camera", "refused: both sizes", "image-size", "json-size", "blender-size"
 )
-@pytest.mark.hard_case(
-    "masks for some frames only; masks of another size", "refused", "json-some-masks", "json-mask-size"
-)
+@pytest.mark.hard_case("masks of another size", "refused", "json-mask-size")
 @pytest.mark.hard_case(
     "NaN or infinity in a pose", "refused: names the image", "nan-pose", "json-nan-pose", "blender-nan"
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 from sadgs_ns.data import colmap
 from sadgs_ns.data.images import SMALL_PHOTO, VIDEO_SUFFIXES, image_size, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
+from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.transforms import GIVE_POSES
 
 _BUNDLER = (
@@ -82,8 +83,7 @@ def no_layout(data: Path) -> str:
         return f"{data} is a part of the capture {capture}: give --data that folder."
     kind = colmap.model_kind(data)
     if kind is not None:
-        first = colmap.image_names(data)[:1]
-        return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
+        return _no_images(data, data / f"images.{kind}")
     elsewhere = poses_elsewhere(data)
     if elsewhere is not None:
         return elsewhere
@@ -111,6 +111,16 @@ def _remedy_for_photos(folder: Path, images: Sequence[Path]) -> str:
     if 0 < longest < SMALL_PHOTO:
         remedy += f"; photos of {longest} px show few features, so give them in their original size"
     return remedy
+
+
+def _no_images(data: Path, poses: Path) -> str:
+    """Return the sentence for a folder with a reconstruction, without the images of its poses."""
+    names = colmap.image_names(data)
+    for name in names[:1]:
+        found = NearbyFiles(data).sentence(data / name)
+        if found is not None:
+            return f"{poses} has poses, but its image {data / name} {found}."
+    return f"{poses} has poses, but its images, such as {names[:1]}, are not in {data}: put them there."
 
 
 def _no_folder(data: Path) -> str:
