@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sadgs_ns.method.ops import Optimizers, Params, State, opacities
 from sadgs_ns.method.schedule import Windows, due
-from sadgs_ns.method.split import children_per_axis, grid_split, num_children
+from sadgs_ns.method.split import MAX_CHILDREN_PER_AXIS, children_per_axis, grid_split, num_children
 from sadgs_ns.method.statistics import consistent
 
 SMALL_SCALE = 0.001
@@ -97,6 +97,19 @@ def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposa
     The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of
     two that are 1.6 times as small on all axes are drawn at random, as 3DGS does.
     """
+    is_small, steepness = _steepness(options, params, state)
+    grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
+    is_split = grows & ~is_small
+    longest = F.one_hot(params["scales"].detach().argmax(dim=-1), 3)  # [N, 3]
+    halved = longest * is_split[:, None]
+    split_in_two = _split_at_random
+    if options.absgs_long_axis:
+        split_in_two = _halve
+    return Proposal(1 + halved, steepness, split_in_two, clone=grows & is_small)
+
+
+def _steepness(options: Options, params: Params, state: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    """Return which Gaussians AbsGS counts as small, bool [N], and their gradients relative to its thresholds [N]."""
     scales = params["scales"].detach()
     count = state["grad_count"].clamp_min(1)
     is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
@@ -104,15 +117,21 @@ def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposa
     mean_absolute = state["absgrad2d"] / count
     clone_ratio = mean_gradient / options.clone_grad2d
     split_ratio = mean_absolute / options.split_absgrad2d
-    steepness = torch.where(is_small, clone_ratio, split_ratio)  # From 1 on a Gaussian grows. [N]
-    grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
-    is_split = grows & ~is_small
-    longest = F.one_hot(scales.argmax(dim=-1), 3)  # [N, 3]
-    halved = longest * is_split[:, None]
-    split_in_two = _split_at_random
-    if options.absgs_long_axis:
-        split_in_two = _halve
-    return Proposal(1 + halved, steepness, split_in_two, clone=grows & is_small)
+    return is_small, torch.where(is_small, clone_ratio, split_ratio)
+
+
+def refill(options: Options, params: Params, state: Mapping[str, Any], share: float) -> Proposal:
+    """Let all Gaussians grow as AbsGS does, the steepest first, so that their number can grow by a share.
+
+    Up to a share of 1 they are halved, and above, they are cut into more parts along the longest axis.
+    """
+    is_small, steepness = _steepness(options, params, state)
+    parts = min(1 + math.ceil(share), MAX_CHILDREN_PER_AXIS)
+    is_small &= parts == 2
+    longest = F.one_hot(params["scales"].detach().argmax(dim=-1), 3)  # [N, 3]
+    added = (parts - 1) * longest * ~is_small[:, None]
+    priority = torch.nan_to_num(steepness, nan=0.0, posinf=0.0)
+    return Proposal(1 + added, priority, _halve, clone=is_small)
 
 
 RULES: dict[str, Rule] = {

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rule, structure_aware
+from sadgs_ns.method.budget import STATE_KEYS, Budget
+from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rule, refill, structure_aware
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -183,6 +184,7 @@ class RunningStrategy(Strategy):
             # A structure step has pruned, and its children are fainter than what it kept.
             if not by_eta:
                 self._prune(params, optimizers, state, FINAL_PRUNE_OPACITY)
+            self._refill(params, optimizers, state, iteration, views)
             _drop_state(state)
         elif self._resets(iteration):
             map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
@@ -236,7 +238,8 @@ class RunningStrategy(Strategy):
         num_pruned = self._prune(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
         map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
         proposal, allowed = self._grow(rule, params, optimizers, state, iteration, views)
-        _empty_state(params, state)  # Children have no observations yet.
+        if iteration < self.windows.refine_stop_iter:
+            _empty_state(params, state)  # Children have no observations yet.
         num_violating = int((proposal.growth > 0).sum())
         names = ("before", "violating", "low", "split", "pruned", "after")
         numbers = (num_before, num_violating, num_low, int(allowed.sum()), num_pruned, len(params["means"]))
@@ -249,7 +252,8 @@ class RunningStrategy(Strategy):
         """Let Gaussians grow by a rule that does not read η, prune the faint, and empty the gradients it has read."""
         self._grow(rule, params, optimizers, state, iteration, views)
         self._prune(params, optimizers, state, self.options.min_opacity)
-        if rule.reads == "gradients":
+        # What fills the cap at the end reads the gradients, too.
+        if rule.reads == "gradients" and iteration < self.windows.refine_stop_iter:
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _grow(
@@ -261,21 +265,50 @@ class RunningStrategy(Strategy):
             The proposal, and which Gaussians grew, bool [N]; N is their number before.
         """
         proposal = rule.propose(self.options, params, state)
-        growth = proposal.growth
-        in_memory = self._room_in_memory(params, state, views)
         num_present = self.world.sums(len(params["means"]))[0]
-        under_cap = self.options.max_gaussians - num_present
-        allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
-        wanted = self.world.sums(int(growth.sum()))[0]
-        allowed_by_cap = min(wanted, under_cap)
-        if in_memory < allowed_by_cap:
+        wanted = self.world.sums(int(proposal.growth.sum()))[0]
+        room = self._budget(state).room(num_present, wanted, iteration / self.windows.refine_stop_iter)
+        allowed = self._allow(proposal, wanted, room, params, state, iteration, views)
+        apply(proposal, allowed, params, optimizers, state)
+        return proposal, allowed
+
+    def _refill(
+        self, params: Params, optimizers: Optimizers, state: State, iteration: int, views: Sequence[Info]
+    ) -> None:
+        """Let those that need it most grow until the cap is reached, if the cap has kept others from growing."""
+        budget = self._budget(state)
+        num_present = self.world.sums(len(params["means"]))[0]
+        room = self.options.max_gaussians - num_present
+        if not budget.outgrew_cap or room <= 0:
+            return
+        proposal = refill(self.options, params, state, room / num_present)
+        wanted = self.world.sums(int(proposal.growth.sum()))[0]
+        allowed = self._allow(proposal, wanted, room, params, state, iteration, views)
+        apply(proposal, allowed, params, optimizers, state)
+
+    def _budget(self, state: State) -> Budget:
+        """Return the budget of the run, which the state keeps."""
+        return Budget(self.options.max_gaussians, state)
+
+    def _allow(
+        self,
+        proposal: Proposal,
+        wanted: int,  # Gaussians that it would add in all processes
+        room: int,  # Gaussians that may be added
+        params: Params,
+        state: State,
+        iteration: int,
+        views: Sequence[Info],
+    ) -> Tensor:
+        """Return which Gaussians may grow, so that they and the memory of a step of such views fit. bool [N]"""
+        in_memory = self._room_in_memory(params, state, views)
+        if in_memory < min(wanted, room):
             warnings.warn(
                 f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are "
                 "added. Lower max_gaussians, use smaller images, or end other programs on the device.",
-                stacklevel=3,
+                stacklevel=4,
             )
-        apply(proposal, allowed, params, optimizers, state)
-        return proposal, allowed
+        return limit_growth(self.world, proposal.growth, proposal.priority, min(room, in_memory))
 
     def _room_in_memory(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> float:
         """Return how many Gaussians can be added in all processes so that a step of such views fits; ≥ 0, or inf."""
@@ -316,7 +349,7 @@ def _empty_state(params: Params, state: State) -> None:
 
 def _drop_state(state: State) -> None:
     """Take the statistics and the screen gradients out of the state, for memory and checkpoints."""
-    for key in empty_state(0, torch.device("cpu")):
+    for key in (*empty_state(0, torch.device("cpu")), *STATE_KEYS):
         state.pop(key, None)
 
 
