@@ -1,4 +1,4 @@
-"""How many Gaussians a run may have at a time, so that its cap is shared out over all of densification."""
+"""How many Gaussians a run may have at a time, so that its cap is spread over all of densification."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ STATE_KEYS = ("first_count", "denied_growth", "outgrew_cap")
 """Entries of the strategy's state that hold a run's budget."""
 
 
-def allowed_gaussians(first: int, cap: int, progress: float) -> int:
-    """Return how many Gaussians may exist after a share `progress` of densification, in [0, 1].
+def growth_share(progress: float) -> float:
+    """Return which share of the growth up to the cap is allowed after a share of densification, both in [0, 1].
 
-    The number grows from the `first` count to the cap, fast at first and slowly at the end, because new Gaussians need
-    time: a tenth of densification allows a fifth of what is between, and a half of it three quarters.
+    It rises fast at first and slowly at the end, because new Gaussians need time: a tenth of densification allows a
+    fifth of the growth, and a half of it three quarters.
     """
     left = 1 - progress
-    share = 1 - left * left
-    return first + int(share * max(cap - first, 0))
+    return 1 - left * left
 
 
 @dataclass
@@ -30,17 +29,18 @@ class Budget:
     state: MutableMapping[str, Any]
 
     def room(self, present: int, wanted: int, progress: float) -> int:
-        """Return how many Gaussians may be added to those present, if rules want some, and remember what is denied.
+        """Return how many Gaussians may be added to those present, and remember what that denies.
 
-        All three count the Gaussians of all processes. The number is negative if too many are present.
+        The allowed number grows from that of the first call to the cap. Counts are those of all processes, and
+        `progress` is the share of densification that is done. The result is negative if too many are present.
         """
         first = self.state.setdefault("first_count", present)
-        allowed = min(allowed_gaussians(first, self.cap, progress), self.cap)
-        room = allowed - present
+        growth = max(self.cap - first, 0)
+        allowed = first + int(growth_share(progress) * growth)
+        room = min(allowed, self.cap) - present
         granted = max(min(wanted, room), 0)
-        # What was denied would have grown further, in proportion.
-        denied = self.state.get("denied_growth", 1.0)
-        without_cap = denied * (present + wanted)
+        # What was denied before would have grown in proportion.
+        without_cap = self.state.get("denied_growth", 1.0) * (present + wanted)
         self.state["denied_growth"] = without_cap / (present + granted)
         if without_cap > self.cap:
             self.state["outgrew_cap"] = True
