@@ -19,7 +19,7 @@ from torch import Tensor
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.budget import STATE_KEYS, Budget
-from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rule, refill, structure_aware
+from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rules, refill, structure_aware
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -133,7 +133,7 @@ class RunningStrategy(Strategy):
             if rule.reads is None:
                 continue
             iteration = next_due(first, rule.every(windows))
-            # Of rules that are due at once, the first one acts.
+            # Of rules that are due at once, the first one says which part of the state the step reads.
             if iteration < soonest:
                 soonest = iteration
                 reads = rule.reads
@@ -151,7 +151,7 @@ class RunningStrategy(Strategy):
             return True
         if due(iteration, windows.reset_every):
             return True
-        return due_rule(iteration, windows) is not None
+        return len(due_rules(iteration, windows)) > 0
 
     def _is_inside(self, iteration: int) -> bool:
         windows = self.windows
@@ -174,12 +174,12 @@ class RunningStrategy(Strategy):
         if not self._is_inside(iteration):
             return
         views = _views(info)
-        rule = due_rule(iteration, self.windows)
-        by_eta = rule is not None and rule.reads == "statistics"
-        if rule is not None and by_eta:
-            self._structure_step(rule, params, optimizers, state, iteration, views)
-        elif rule is not None:
-            self._growth_step(rule, params, optimizers, state, iteration, views)
+        rules = due_rules(iteration, self.windows)
+        by_eta = any(rule.reads == "statistics" for rule in rules)
+        if by_eta:
+            self._structure_step(rules, params, optimizers, state, iteration, views)
+        elif rules:
+            self._growth_step(rules, params, optimizers, state, iteration, views)
         if iteration == self.windows.refine_stop_iter:
             # A structure step has pruned, and its children are fainter than what it kept.
             if not by_eta:
@@ -225,7 +225,7 @@ class RunningStrategy(Strategy):
     # --- parts of a densification step ---
 
     def _structure_step(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
         """Prune by η, let Gaussians grow by it, and empty the state."""
         num_before = len(params["means"])
@@ -237,29 +237,56 @@ class RunningStrategy(Strategy):
             faint = max(faint, FINAL_PRUNE_OPACITY)
         num_pruned = self._prune(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
         map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
-        proposal, allowed = self._grow(rule, params, optimizers, state, iteration, views)
+        num_violating, num_grown = self._grow(rules, params, optimizers, state, iteration, views)
         if iteration < self.windows.refine_stop_iter:
             _empty_state(params, state)  # Children have no observations yet.
-        num_violating = int((proposal.growth > 0).sum())
         names = ("before", "violating", "low", "split", "pruned", "after")
-        numbers = (num_before, num_violating, num_low, int(allowed.sum()), num_pruned, len(params["means"]))
+        numbers = (num_before, num_violating, num_low, num_grown, num_pruned, len(params["means"]))
         of_all = dict(zip(names, self.world.sums(*numbers), strict=True))
         state.setdefault("structure_steps", []).append({"iteration": iteration, **of_all})
 
     def _growth_step(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
-        """Let Gaussians grow by a rule that does not read η, prune the faint, and empty the gradients it has read."""
-        self._grow(rule, params, optimizers, state, iteration, views)
+        """Let Gaussians grow by rules that do not read η, prune the faint, and empty the gradients that were read."""
+        self._grow(rules, params, optimizers, state, iteration, views)
         self._prune(params, optimizers, state, self.options.min_opacity)
-        # What fills the cap at the end reads the gradients, too.
-        if rule.reads == "gradients" and iteration < self.windows.refine_stop_iter:
+        # At the end, what fills the cap reads the gradients, too.
+        was_read = any(rule.reads == "gradients" for rule in rules)
+        if was_read and iteration < self.windows.refine_stop_iter:
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _grow(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+    ) -> tuple[int, int]:
+        """Let Gaussians grow as rules propose, one after the other; each gets an equal share of the room that is left.
+
+        Returns:
+            How many Gaussians of this process violate by η, and how many of these grew.
+        """
+        num_violating = 0
+        num_grown = 0
+        for position, rule in enumerate(rules):
+            num_sharing = len(rules) - position
+            proposal, allowed = self._grow_by(rule, num_sharing, params, optimizers, state, iteration, views)
+            if rule.reads == "statistics":
+                num_violating += int((proposal.growth > 0).sum())
+                num_grown += int(allowed.sum())
+        return num_violating, num_grown
+
+    def _grow_by(
+        self,
+        rule: Rule,
+        num_sharing: int,
+        params: Any,
+        optimizers: Any,
+        state: Any,
+        iteration: int,
+        views: Sequence[Info],
     ) -> tuple[Proposal, Tensor]:
         """Let Gaussians grow as a rule proposes, within the cap and the memory that views like these leave.
+
+        The room is shared with `num_sharing` - 1 rules that are asked afterwards.
 
         Returns:
             The proposal, and which Gaussians grew, bool [N]; N is their number before.
@@ -268,39 +295,33 @@ class RunningStrategy(Strategy):
         num_present = self.world.sums(len(params["means"]))[0]
         wanted = self.world.sums(int(proposal.growth.sum()))[0]
         room = self._budget(state).room(num_present, wanted, iteration / self.windows.refine_stop_iter)
-        allowed = self._allow(proposal, wanted, room, params, state, iteration, views)
+        room = self._room_with_memory(wanted, room, params, state, iteration, views)
+        allowed = limit_growth(self.world, proposal.growth, proposal.priority, room // num_sharing)
         apply(proposal, allowed, params, optimizers, state)
         return proposal, allowed
 
     def _refill(
         self, params: Params, optimizers: Optimizers, state: State, iteration: int, views: Sequence[Info]
     ) -> None:
-        """Let those that need it most grow until the cap is reached, if the cap has kept others from growing."""
-        budget = self._budget(state)
+        """Let those grow that need it most until the cap is reached, in a run that would have outgrown it."""
         num_present = self.world.sums(len(params["means"]))[0]
         room = self.options.max_gaussians - num_present
-        if not budget.outgrew_cap or room <= 0:
+        if room <= 0 or not self._budget(state).outgrew_cap:
             return
         proposal = refill(self.options, params, state, room / num_present)
         wanted = self.world.sums(int(proposal.growth.sum()))[0]
-        allowed = self._allow(proposal, wanted, room, params, state, iteration, views)
+        in_memory = self._room_with_memory(wanted, room, params, state, iteration, views)
+        allowed = limit_growth(self.world, proposal.growth, proposal.priority, in_memory)
         apply(proposal, allowed, params, optimizers, state)
 
     def _budget(self, state: State) -> Budget:
-        """Return the budget of the run, which the state keeps."""
+        """Return the budget of the run, which its state keeps."""
         return Budget(self.options.max_gaussians, state)
 
-    def _allow(
-        self,
-        proposal: Proposal,
-        wanted: int,  # Gaussians that it would add in all processes
-        room: int,  # Gaussians that may be added
-        params: Params,
-        state: State,
-        iteration: int,
-        views: Sequence[Info],
-    ) -> Tensor:
-        """Return which Gaussians may grow, so that they and the memory of a step of such views fit. bool [N]"""
+    def _room_with_memory(
+        self, wanted: int, room: int, params: Params, state: State, iteration: int, views: Sequence[Info]
+    ) -> float:
+        """Return the room for more Gaussians, or less if memory lacks that; warn if it cannot hold what is wanted."""
         in_memory = self._room_in_memory(params, state, views)
         if in_memory < min(wanted, room):
             warnings.warn(
@@ -308,7 +329,7 @@ class RunningStrategy(Strategy):
                 "added. Lower max_gaussians, use smaller images, or end other programs on the device.",
                 stacklevel=4,
             )
-        return limit_growth(self.world, proposal.growth, proposal.priority, min(room, in_memory))
+        return min(room, in_memory)
 
     def _room_in_memory(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> float:
         """Return how many Gaussians can be added in all processes so that a step of such views fits; ≥ 0, or inf."""

@@ -113,7 +113,7 @@ def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = {name: p.detach().clone() for name, p in params.items()}
-    cap = 50 + math.ceil((3 * 511 + 100) / growth_share(10 / 24))
+    cap = 50 + math.ceil((3 * 511 + 100) / growth_share(10 / 24))  # This step may use so much of it.
     short(max_gaussians=cap).for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
     assert all(p.isfinite().all() for p in params.values())
