@@ -19,7 +19,20 @@ from torch import Tensor
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method.budget import STATE_KEYS, Budget
-from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rules, refill, structure_aware
+from sadgs_ns.method.growth import (
+    RULES,
+    Options,
+    Proposal,
+    Propose,
+    Rule,
+    apply,
+    apply_best,
+    best_of,
+    due_rules,
+    refill,
+    rivals,
+    structure_aware,
+)
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -296,8 +309,14 @@ class RunningStrategy(Strategy):
         wanted = self.world.sums(int(proposal.growth.sum()))[0]
         room = self._budget(state).room(num_present, wanted, iteration / self.windows.refine_stop_iter)
         room = self._room_with_memory(wanted, room, params, state, iteration, views)
-        allowed = limit_growth(self.world, proposal.growth, proposal.priority, room // num_sharing)
-        apply(proposal, allowed, params, optimizers, state)
+        room = room // num_sharing
+        proposals = [proposal]
+        if wanted > room:
+            for rival in rivals(rule):
+                proposals.append(rival.propose(self.options, params, state))
+        chosen, growth, priority = best_of(proposals)
+        allowed = limit_growth(self.world, growth, priority, room)
+        apply_best(proposals, chosen, allowed, params, optimizers, state)
         return proposal, allowed
 
     def _refill(

@@ -200,7 +200,8 @@ def test_rules_that_are_due_together_share_the_budget_of_a_step(monkeypatch: pyt
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 5, recorded(asked, "longest", longest)))
     strategy = short(max_gaussians=100, absgs_every=5, clone_grad2d=1e-9, split_absgrad2d=1e-9, structure_every=10)
     _, state, counts = train(strategy, 5)
-    assert asked == [("absgs", 60), ("longest", 80)] and counts[-1] == 100
+    assert asked == [("absgs", 60), ("structure", 60), ("longest", 80)], "AbsGS's is ranked together with η's"
+    assert counts[-1] == 100
     assert not state["grad_count"].any(), "AbsGS has read them"
     asked.clear()
     strategy.max_gaussians = 1000
@@ -461,8 +462,8 @@ def test_what_would_be_split_now_keeps_to_the_cap():
         return strategy.for_run(3000).planned_children(params, statistics)
 
     assert planned().tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
-    strategy.max_gaussians = 5  # room for two more: the larger η comes first
-    assert planned().tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 5  # room for two more: √4 for one comes before √9 for two
+    assert planned().tolist() == [[2, 1, 1], [1, 1, 1], [1, 1, 1]]
     strategy.max_gaussians = 2
     assert (planned() == 1).all()
     strategy.max_gaussians, strategy.min_observations = 6, 2
