@@ -83,7 +83,8 @@ class SadgsModelConfig(InstantiateConfig):
     None is 150,000, or 0 with fewer than 3 training views or one SfM point for every 30 pixels of an image."""
     dropout: float | None = None
     """Probability with which a training step leaves a Gaussian out, in [0, 0.9], against overfitting of few views.
-    None follows from how often each view is rendered: 0 up to 85 times, and 0.1 more for each doubling, up to 0.25."""
+    None follows from how often each view is rendered: 0 up to 85 times, and 0.1 more for each doubling, up to 0.25.
+    Above 40 training views it is the less, the more there are."""
     clear_paths: bool = True
     """Prune Gaussians that float near the cameras' paths, again and again; viewers of files would show them as haze."""
     initial_opacity: float = POINT_OPACITY
@@ -196,7 +197,8 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """The Gaussians and their densification."""
     effort: float = 1.0
     """How much training the capture gets, relative to what its number of views asks for: 0.25, 0.5, 1, 2, 4 or 8.
-    0.5 is a draft of half as many renderings; 2 renders twice as many, of more Gaussians if there are many views."""
+    0.5 is a draft of half as many renderings. 2 renders up to twice as many, and lets more Gaussians grow if there are
+    many views."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
