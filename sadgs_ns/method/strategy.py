@@ -27,8 +27,8 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded. A run that would outgrow it uses it bit by bit, lets those
-    grow first that need it most, and fills it when densification ends.
+    """Hard cap on the number of Gaussians, never exceeded.
+    A run that would outgrow it lets those grow first that need it most, and fills it when densification ends.
     On CUDA fewer are added, with a warning, if the device's memory cannot hold more."""
     structure_every: int | None = None
     """Iterations between structure-aware split and prune steps; None is a sixth of the run, 0 turns them off."""

@@ -74,6 +74,12 @@ class PoseOptimizerConfig(CameraOptimizerConfig):
     """Whether and how the cameras' poses were refined."""
 
 
+# What no measurement advises to change, and only the paper's presets or earlier runs do, would lengthen the help.
+hide("min_observations", "split_min_opacity", "child_scale", "min_opacity", "absgs_long_axis")(StructureAwareStrategy)
+hide("eta_every", "refine_start_iter", "reset_every")(StructureAwareStrategy)
+
+
+@hide("random_scale", "initial_opacity", "averaged_share", "max_off_axis")
 @dataclass
 class SadgsModelConfig(InstantiateConfig):
     """Options of the Gaussians, their loss and their densification; most of splatfacto's have no place here."""
@@ -209,6 +215,7 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
     check_ranges("pipeline.datamanager.", config, ranges)
 
 
+@hide("epsilon", "energy_blur")
 @dataclass
 class SadgsPipelineConfig(VanillaPipelineConfig):
     """Options of the data, the model and the structure tensors of the images."""
@@ -220,8 +227,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """The Gaussians and their densification."""
     effort: float = 1.0
     """How much training the capture gets, relative to what its number of views asks for: 0.25, 0.5, 1, 2, 4 or 8.
-    0.5 is a draft of half as many renderings. 2 renders up to twice as many, and lets more Gaussians grow if there are
-    many views."""
+    0.5 is a draft of half as many renderings. 2 renders up to twice as many, of more Gaussians if views are many."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -288,6 +294,7 @@ class SadgsViewerConfig(ViewerConfig):
 
 @hide("method_name", "prompt", "project_name", "relative_model_dir", "load_scheduler", "log_gradients")
 @hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
+@hide("rates_follow_views")
 @dataclass
 class SadgsTrainerConfig(TrainerConfig):
     """Options of `ns-train sadgs`, checked before a run starts."""

@@ -13,7 +13,10 @@ from sadgs_ns.render.types import Gaussians
 
 MOST_OPACITY = 0.999
 """Largest opacity of a Gaussian that stays, since opacities are raised for those that are left out."""
-_STEPS_OF_A_SEED = 2**32
+_STEPS_OF_A_SEED = 1_000_003
+"""Steps after which a run draws the numbers of the next seed's run, a prime."""
+_SEEDS = 2**32
+"""Number of seeds that torch's generator on the CPU tells apart."""
 
 
 class Dropout:
@@ -31,7 +34,7 @@ class Dropout:
 
     def begin(self, step: int) -> None:
         """Choose the numbers of a step; this does not wait for the device."""
-        self.generator.manual_seed((self._seed * _STEPS_OF_A_SEED + step) % 2**63)
+        self.generator.manual_seed((self._seed * _STEPS_OF_A_SEED + step) % _SEEDS)
 
     def apply(self, gaussians: Gaussians) -> Gaussians:
         """Return the Gaussians with an opacity of 0, or with one that is 1 / (1 − rate) as large.
