@@ -76,8 +76,9 @@ def face_grid(pixels: int, per_pixel: float) -> int:
 def neighbour_scales(
     points: Tensor,  # [P, 3]
 ) -> Tensor:
-    """The initial scale of points, > 0: the mean distance to the 3 nearest neighbours (3DGS, splatfacto). [P]
+    """The initial scale of points, > 0: the mean distance to the 3 nearest neighbours, as in splatfacto. [P]
 
+    3DGS takes the root of the mean square of these distances, which is larger.
     It is at least a millionth of the cloud's extent, so as to have a logarithm.
 
     Raises:
