@@ -1,7 +1,8 @@
-"""`python -m benchmarks views RESULTS.jsonl …`: the PSNR of each held-out view, and where it collapses.
+"""`python -m benchmarks views RESULTS.jsonl …`: the PSNR of each held-out view, and runs that lie far below others.
 
-The reference of a view is the best label's median over seeds of its PSNR. A view collapses in a run whose PSNR lies
-COLLAPSE dB or more under it. With `--references` the runs of these files alone make references, which so stay the same.
+A view collapses in a run whose PSNR lies FAR dB or more under the median of the same label's other seeds. The reference
+of a view is the best label's median over seeds of its PSNR, and a run's view is far behind if it lies FAR dB or more
+under that. With `--references` the runs of these files alone make references, which so stay the same.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from tyro.conf import Positional
 from benchmarks import results, table
 from benchmarks.results import Result
 
-COLLAPSE = 3.0
-"""Difference from the reference at which a view collapses, in dB."""
+FAR = 3.0
+"""Difference in dB from which on a view collapses, or is far behind."""
 Runs = Mapping[str, Sequence[Result]]
 """The runs of one scene by their labels, one a seed."""
 
@@ -54,14 +55,33 @@ def references(runs: Runs) -> list[float]:
     return [max(view) for view in zip(*medians, strict=True)]
 
 
-def collapsed(group: Sequence[Result], reference: Sequence[float]) -> list[tuple[int, Any]]:
-    """Return the pairs of a view's number and a seed in which one label's view collapses."""
+def far_behind(group: Sequence[Result], reference: Sequence[float]) -> list[tuple[int, Any]]:
+    """Return the pairs of a view's number and a seed in which one label's view lies far under its reference."""
     return [
         (view, row["seed"])
         for view, best in enumerate(reference)
         for row in group
-        if round(best - row["view_psnr"][view], 6) >= COLLAPSE  # floats make 30.1 − 27.1 less than 3
+        if _is_far(row["view_psnr"][view], best)
     ]
+
+
+def collapsed(group: Sequence[Result]) -> list[tuple[int, Any]]:
+    """Return the pairs of a view's number and a seed in which a view lies far under the label's other seeds.
+
+    A single seed has nothing to compare with.
+    """
+    pairs = []
+    for view, values in enumerate(_by_view(group)):
+        for index, row in enumerate(group):
+            others = values[:index] + values[index + 1 :]
+            if others and _is_far(values[index], statistics.median(others)):
+                pairs.append((view, row["seed"]))
+    return pairs
+
+
+def _is_far(psnr: float, reference: float) -> bool:
+    """Return whether a PSNR lies FAR dB or more under a reference."""
+    return round(reference - psnr, 6) >= FAR  # Floats make 30.1 − 27.1 less than 3.
 
 
 def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[float]) -> str:
@@ -78,10 +98,20 @@ def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[f
     for label, group in runs.items():
         median = statistics.median(statistics.fmean(view) for view in _by_view(group))
         lowest, worst = min((psnr, i) for row in group for i, psnr in enumerate(row["view_psnr"]))
-        pairs = [f"{names[i]} (seed {seed})" for i, seed in collapsed(group, reference)]
-        told = f"collapsed: {', '.join(pairs) or 'none'}" if reference else "there is no reference"
-        text.append(f"- {label}: median {median:.2f} dB; worst view {names[worst]}, {lowest:.2f} dB; {told}")
+        told = [f"median {median:.2f} dB", f"worst view {names[worst]}, {lowest:.2f} dB"]
+        if reference:
+            told.append(f"far behind: {_listed(names, far_behind(group, reference))}")
+        else:
+            told.append("there is no reference")
+        if len(group) > 1:
+            told.append(f"collapsed: {_listed(names, collapsed(group))}")
+        text.append(f"- {label}: {'; '.join(told)}")
     return "\n".join(text)
+
+
+def _listed(names: Sequence[str], pairs: Sequence[tuple[int, Any]]) -> str:
+    """Return pairs of a view's number and a seed in words."""
+    return ", ".join(f"{names[view]} (seed {seed})" for view, seed in pairs) or "none"
 
 
 def _by_view(group: Sequence[Result]) -> list[tuple[float, ...]]:
@@ -100,7 +130,7 @@ def _mean_and_deviation(values: Sequence[float]) -> str:
 
 @dataclass
 class Command:
-    """Print the PSNR of held-out views, and which lie 3 dB or more under the best label's median."""
+    """Print the PSNR of held-out views, and which lie 3 dB or more under other seeds or the best label's median."""
 
     results: Positional[tuple[Path, ...]]
     """files that python -m benchmarks wrote"""
@@ -108,7 +138,8 @@ class Command:
     """files whose runs alone make the references (default: the results)"""
 
     def __call__(self) -> int:
-        counts: dict[str, tuple[int, int]] = {}  # collapsed pairs, and all that have a reference
+        behind: dict[str, tuple[int, int]] = {}  # pairs that are far behind, and all that have a reference
+        lost: dict[str, tuple[int, int]] = {}  # pairs that collapsed, and all whose label has other seeds
         scenes = load(self.results)
         frozen = load(self.references) if self.references else scenes
         for scene, runs in scenes.items():
@@ -117,8 +148,14 @@ class Command:
             reference = references(others)
             print(markdown(scene, runs, names, reference), end="\n\n")
             for label, group in runs.items():
-                bad, judged = counts.get(label, (0, 0))
-                counts[label] = bad + len(collapsed(group, reference)), judged + len(group) * len(reference)
-        for label, (bad, judged) in counts.items():
-            print(f"{label}: {bad} of {judged} (view, run) pairs collapsed")
+                bad, judged = behind.get(label, (0, 0))
+                behind[label] = bad + len(far_behind(group, reference)), judged + len(group) * len(reference)
+                bad, judged = lost.get(label, (0, 0))
+                if len(group) > 1:
+                    judged += len(group) * len(names)
+                lost[label] = bad + len(collapsed(group)), judged
+        for label, (bad, judged) in behind.items():
+            print(f"{label}: {bad} of {judged} (view, run) pairs are far behind", end="; ")
+            bad, judged = lost[label]
+            print(f"{bad} of {judged} whose label has other seeds collapsed")
         return 0

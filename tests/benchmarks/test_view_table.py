@@ -1,4 +1,4 @@
-"""`python -m benchmarks views`: spread, worst and collapsed views, from made-up rows."""
+"""`python -m benchmarks views`: spread and worst views, those far behind and collapsed ones, from made-up rows."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ BASE = [row("base", seed, [30.1, psnr], **NAMED) for seed, psnr in enumerate((20
 OURS = [row("ours", 0, [27.1, 21.0], **NAMED), row("ours", 1, [27.11, 17.5], **NAMED)]
 
 
-def test_spread_worst_view_and_collapses_of_each_label(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_spread_worst_view_views_far_behind_and_collapses_of_each_label(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     fold = [row("ours", 0, [25.0], "fox-2"), row("ours", 1, [21.0], "fox-2")]
     files = [write(tmp_path / "1.jsonl", *BASE), write(tmp_path / "2.jsonl", *OURS, *fold)]
     assert bench.main(["views", *files]) == 0
@@ -41,8 +43,8 @@ def test_spread_worst_view_and_collapses_of_each_label(tmp_path: Path, capsys: p
 | a | 4.0 | 0.125 | 30.10 ± 0.00 | 27.11 ± 0.01 |
 | b | – | 0.500 | 23.00 ± 4.36 | 19.25 ± 2.47 |
 
-- base: median 26.55 dB; worst view b, 20.00 dB; collapsed: none
-- ours: median 23.18 dB; worst view b, 17.50 dB; collapsed: a (seed 0), b (seed 1)
+- base: median 26.55 dB; worst view b, 20.00 dB; far behind: none; collapsed: b (seed 0), b (seed 1)
+- ours: median 23.18 dB; worst view b, 17.50 dB; far behind: a (seed 0), b (seed 1); collapsed: b (seed 1)
 
 ## fox-2
 
@@ -50,10 +52,10 @@ def test_spread_worst_view_and_collapses_of_each_label(tmp_path: Path, capsys: p
 | --- | ---: | ---: | ---: |
 | 0 | – | – | 23.00 ± 2.83 |
 
-- ours: median 23.00 dB; worst view 0, 21.00 dB; collapsed: none
+- ours: median 23.00 dB; worst view 0, 21.00 dB; far behind: none; collapsed: 0 (seed 1)
 
-base: 0 of 6 (view, run) pairs collapsed
-ours: 2 of 6 (view, run) pairs collapsed
+base: 0 of 6 (view, run) pairs are far behind; 2 of 6 whose label has other seeds collapsed
+ours: 2 of 6 (view, run) pairs are far behind; 2 of 6 whose label has other seeds collapsed
 """
     )
 
@@ -63,8 +65,10 @@ def test_frozen_references_alone_count_and_may_be_older(tmp_path: Path, capsys: 
     old = [row("old", 0, [24.0, 23.5]), row("old", 1, [24.0, 24.5]), row("worse", 0, [9.0, 9.0])]
     assert bench.main(["views", results, "--references", write(tmp_path / "f.jsonl", *old)]) == 0
     told = capsys.readouterr().out
-    assert "worst view b, 20.00 dB; collapsed: b (seed 0), b (seed 1)\n" in told and "25.00 dB; there is no ref" in told
-    assert told.endswith("base: 2 of 6 (view, run) pairs collapsed\nours: 2 of 4 (view, run) pairs collapsed\n")
+    assert "worst view b, 20.00 dB; far behind: b (seed 0), b (seed 1); " in told
+    assert "25.00 dB; there is no reference\n" in told
+    assert "base: 2 of 6 (view, run) pairs are far behind; " in told
+    assert "ours: 2 of 4 (view, run) pairs are far behind; " in told
     assert "old" not in told
 
 
@@ -73,6 +77,8 @@ def test_runs_without_views_are_skipped_and_older_ones_number_them(tmp_path: Pat
     assert bench.main(["views", write(tmp_path / "r.jsonl", *rows)]) == 0
     out, error = capsys.readouterr()
     assert "| 0 | – | – | 26.00 |\n| 1 | – | – | 20.00 |\n" in out and "base" not in out
+    assert "20.00 dB; far behind: none\n" in out  # A single seed cannot collapse.
+    assert "0 of 0 whose label has other seeds collapsed\n" in out
     assert error == "Runs without view_psnr are skipped, 2 of them, such as fox/ours/1/None.\n"
 
 
