@@ -145,10 +145,10 @@ from pathlib import Path
 from sadgs_ns import programs
 programs.LIBUSB = "libusb-of-no-system.so.0"
 from sadgs_ns.cli import doctor, export
-doctor.main([])
 for name in ("splat.html", "splat.mesh.ply"):
     assert export.main([{run!r}, "--data", {scene!r}, "--output", {folder!r} + "/" + name]) == 0
 lines = Path("/proc/self/maps").read_text().splitlines()
+doctor.main([])  # It loads libusb itself, and so comes last.
 print("LOADED", {{line.split()[-1] for line in lines if "libusb" in line}})
 """
 WRITER = """
