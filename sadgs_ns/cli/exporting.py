@@ -21,7 +21,10 @@ from sadgs_ns.training.run import checkpoints  # noqa: E402, F401
 def export_all(jobs: Sequence[Export]) -> None:
     """Export as `export` does, print the command that would, and report each file before and after it is made."""
     for job in jobs:
-        print("$", shlex.join(["sadgs-export", str(job.run), "--output", str(job.output), "--data", str(job.data)]))
+        words = ["sadgs-export", str(job.run), "--output", str(job.output), "--data", str(job.data)]
+        if job.title is not None:
+            words += ["--title", job.title]
+        print("$", shlex.join(words))
         report("export begins", output=str(job.output))
         export(job)
         report("export ends", output=str(job.output))

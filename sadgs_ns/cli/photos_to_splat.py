@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -18,6 +19,7 @@ from sadgs_ns.cli.sadgs_options import Sadgs, check_options, choose_formats
 from sadgs_ns.cli.status_line import StatusLine, Timeline
 from sadgs_ns.errors import InputError, RunError, WriteError
 from sadgs_ns.files import check_encoding, locked
+from sadgs_ns.placing.folder import is_result
 from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.video import count_frames
 from sadgs_ns.worker import OnEvent, Worker, WorkerError
@@ -34,6 +36,7 @@ class PhotosToSplat:
         train_options: The options for ns-train.
         console: Where the lines of the stages are printed.
         source: The photos or the video.
+        title: The title of the page, which is the source's name.
         folder: The folder for all results.
         results: The same folder, with its settings.
         formats: The formats to export, in this order.
@@ -49,8 +52,10 @@ class PhotosToSplat:
         self.train_options = train_options
         self.console = console
         self.source = options.source
+        self.title = _name_of(options.source)
         self.folder = options.output or _default_folder(options.source)
         self.results = SadgsFolder(self.folder)
+        _check_source(options.source)
         self.formats = choose_formats(options.formats, options.measure, console)
         self.given = find_given_cameras(options, train_options)
         self.timeline = Timeline()
@@ -156,10 +161,31 @@ class PhotosToSplat:
             raise RunError(f"{problem}; run the same command again to resume.") from None
 
 
+def _check_source(source: Path) -> None:
+    """Raise InputError if the source is a folder of results, and say how to show it or to go on with it."""
+    if not is_result(source):
+        return
+    settings = Settings.read(source / "settings.json", source)
+    photos = "PHOTOS"
+    if settings is not None and settings.source is not None:
+        photos = shlex.quote(settings.source)
+    shown = ""
+    files = [source / f"splat.{name}" for name in ("html", "ply")]
+    for file in [file for file in files if file.is_file()][:1]:
+        shown = f"open {file} to see it, or "
+    remedy = f"{shown}run `sadgs {photos} --output {shlex.quote(str(source))}` to go on with it"
+    raise InputError(f"{source} is a result of sadgs, and no photos: {remedy}.")
+
+
 def _default_folder(source: Path) -> Path:
     """Name the folder for the results after the source, in the working directory."""
+    return Path(f"{_name_of(source)}-splat")
+
+
+def _name_of(source: Path) -> str:
+    """Return the name of photos' folder, or of a video without its suffix."""
     real = Path(os.path.realpath(source))
     name = real.stem
     if real.is_dir():
         name = real.name
-    return Path(f"{name or 'photos'}-splat")
+    return name or "photos"

@@ -117,6 +117,8 @@ def _explain_poor(summary: Summary, out: str) -> str:
         remedy = "another folder with such photos"
     else:
         problem = f"{out} shows only what {summary.registered} of {summary.photos} photos saw."
+    if summary.larger_photos:
+        remedy = f"another folder with {summary.larger_photos}"
     if summary.matching != "exhaustive":
         remedy = f"the same command with --matching exhaustive, which uses the features found so far; or {remedy}"
     return f"warning: {problem} Try {remedy}. This trains on what is there: ns-train sadgs --data {out}"

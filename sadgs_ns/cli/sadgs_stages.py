@@ -76,6 +76,8 @@ def _explain_poor(found: str, summary: Summary, command: list[str]) -> str:
     else:
         problem = f"only {found}, so the splat would show only what these saw: "
         remedies = "take more photos between the others, with two thirds of overlap, and begin another --output; "
+    if summary.larger_photos:
+        remedies = f"begin another --output with {summary.larger_photos}; "
     if summary.matching != "exhaustive":
         exhaustive = shlex.join([*command, "--matching", "exhaustive"])
         remedies += f"or compare more pairs of them with `{exhaustive}`, and run this command again; "
@@ -183,8 +185,11 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
         if _is_current(work, output):
             progress.finished.append(f"{output}; done before")
         else:
+            title = None
+            if name == "html":
+                title = work.title
             # The folder may have been renamed since config.yml noted where the scene is.
-            jobs.append(Export(work.results.run, output, data=work.data))
+            jobs.append(Export(work.results.run, output, data=work.data, title=title))
     for name in FORMAT_NAMES:
         output = work.results.splat(name)
         if name not in work.formats and output.is_file() and not _is_current(work, output):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 from collections.abc import Callable
 from contextlib import suppress
@@ -19,6 +20,25 @@ from sadgs_ns.errors import reason
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp"}
 """Suffixes of the formats of photos that training reads."""
+UNREAD_SUFFIXES = {
+    ".heic", ".heif", ".jxl", ".exr", ".hdr", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef",
+    ".srw",
+}  # fmt: skip
+"""Suffixes of HEIC, JPEG XL, pixels without a limit, and raw files, which training does not read.
+
+Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
+UNREAD_REMEDY = (
+    "convert it, as ImageMagick's `mogrify -format png` does, and put the PNG in its place under the name in the poses"
+)
+"""What to do with an image in a format that is not read. The name's suffix does not matter to training."""
+_UNREAD_STARTS = {
+    "HEIC": rb"....ftyp(hei|hev|mif1|msf1)",
+    "JPEG XL": rb"\xff\x0a|\x00\x00\x00\x0cJXL ",
+    "OpenEXR": rb"\x76\x2f\x31\x01",
+    "Radiance": rb"#\?R(ADIANCE|GBE)",
+    "raw": rb"....ftypcrx|FUJIFILMCCD-RAW|IIRO|IIU\x00|MMOR",
+}
+"""How files in formats that are not read begin, in regular expressions."""
 VIDEO_SUFFIXES = {
     ".3gp", ".avi", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".mxf", ".ogv", ".webm", ".wmv",
 }  # fmt: skip
@@ -35,6 +55,8 @@ NOT_UPRIGHT = range(2, 9)  # EXIF's orientations of turned or mirrored images. P
 SIDEWAYS = range(5, 9)  # Those of them that exchange the sides
 GREY_MODES = ("L", "1", "I;16", "I")
 """Pillow's modes of images with one number a pixel, as masks have."""
+NO_MASK = Path("no mask")
+"""Stands among masks' files for that of an image without mask, of which nothing is hidden."""
 Rounding = Literal["floor", "round", "ceil"]
 Size = tuple[int, int]  # Width and height in px
 
@@ -82,7 +104,10 @@ def read_header(path: Path) -> Header:
                 orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
             has_profile = color_profile(image) is not None
             header = Header(image.size, image.mode, image.format or "", orientation, has_profile)
-            is_whole = _ends_well(path, image)
+            is_unread = image.format == "HEIF" or (image.format == "TIFF" and path.suffix.lower() in UNREAD_SUFFIXES)
+            is_whole = is_unread or _ends_well(path, image)
+        if is_unread:
+            return Header(problem=_unread_problem(path))
         if not is_whole:
             with Image.open(path) as image:
                 image.load()
@@ -90,9 +115,23 @@ def read_header(path: Path) -> Header:
     except FileNotFoundError:
         return Header(problem="does not exist: put it there, or leave it out of the reconstruction")
     except UnidentifiedImageError:
+        if _unread_format(path) is not None:
+            return Header(problem=_unread_problem(path))
         return Header(problem=f"is no image that Pillow knows: {remedy}")
     except Exception as error:  # Decoders raise OSError, SyntaxError, struct.error, …
         return Header(problem=f"cannot be read as an image ({reason(error)}): {remedy}")
+
+
+def _unread_format(path: Path) -> str | None:
+    """Return the name of a file's format if its first bytes are those of one that is not read, or None."""
+    with path.open("rb") as file:
+        start = file.read(16)
+    return next((name for name, pattern in _UNREAD_STARTS.items() if re.match(pattern, start, re.DOTALL)), None)
+
+
+def _unread_problem(path: Path) -> str:
+    """Return the rest of a sentence on a file whose format is not read, or is that of a raw file if none is known."""
+    return f"is a file in the format {_unread_format(path) or 'raw'}, which is not read: {UNREAD_REMEDY}"
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
@@ -107,6 +146,10 @@ def _ends_well(path: Path, image: Image.Image) -> bool:
         image.verify()  # This reads its checksums.
         return True
     return False
+
+
+SMALL_PHOTO = 640
+"""Longest side in px below which a photo shows few features; those of phones have 3,000 and more."""
 
 
 def image_size(path: Path) -> Size:
@@ -216,8 +259,11 @@ def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) 
     return factor
 
 
-def mask_name(folder: Path, image: str) -> Path:
-    """Return the file of an image's mask, relative to a folder of masks, by the first name in use that exists there."""
+def mask_name(folder: Path, image: str) -> Path | None:
+    """Return the file of an image's mask, relative to a folder of masks, by the first name in use that exists there.
+
+    None if the image has no mask.
+    """
     stem = PurePosixPath(image).with_suffix("")
     names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]
-    return next((name for name in names if (folder / name).is_file()), names[0])
+    return next((name for name in names if (folder / name).is_file()), None)

@@ -16,6 +16,7 @@ from sadgs_ns.data.images import Rounding
 from sadgs_ns.errors import InputError, reason
 
 COLMAP_FOLDERS = ("colmap/sparse/0", "sparse/0", "sparse", "colmap")  # Places of a reconstruction, nerfstudio's first
+_MOST_FOLDERS = 100  # In which the images of a reconstruction are looked for
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,18 @@ def images_folder(data: Path, model: Path, names: Sequence[str]) -> Path | None:
     for folder in map(Path, ("images", "", model, *beside, *sorted(others))):
         if any(os.path.isfile(data / folder / name) for name in names):
             return folder
+    for folder in _folders_in(data, "images"):
+        if names and all(os.path.isfile(data / folder / name) for name in names):
+            return folder
     return None
+
+
+def _folders_in(data: Path, name: str) -> list[Path]:
+    """Return the folders in a folder of the data, and in those, relative to the data."""
+    folders = []
+    for pattern in ("*/", "*/*/"):
+        folders += sorted((data / name).glob(pattern))[:_MOST_FOLDERS]
+    return [folder.relative_to(data) for folder in folders]
 
 
 def automatic_options(data: Path) -> ParserOptions:

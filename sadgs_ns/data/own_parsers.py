@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
-from sadgs_ns.data.images import mask_name
+from sadgs_ns.data.images import NO_MASK, mask_name
 from sadgs_ns.data.run_frame import POINTS_FILE, centre_poses, points_in_the_run, undo_centring
 from sadgs_ns.data.transforms import blender_images, read_blender
 from sadgs_ns.data.transforms_parser import TransformsParser, scene_box
@@ -94,9 +94,23 @@ class ColmapParser(ColmapDataParser):
             images = config.data / config.images_path
             for frame in meta["frames"]:
                 name = os.path.relpath(frame["file_path"], images.as_posix())
-                frame["mask_path"] = (masks / mask_name(masks, name)).as_posix()
+                mask = mask_name(masks, name)
+                frame["mask_path"] = str(NO_MASK)
+                if mask is not None:
+                    frame["mask_path"] = (masks / mask).as_posix()
         self._middle = centre_poses(meta, config.center_method).of_data
         return meta
+
+    def _setup_downscale_factor(self, image_filenames: list[Path], mask_filenames: list[Path], *others: Any) -> Any:
+        present = [mask for mask in mask_filenames if mask != NO_MASK]
+        images, smaller, depths, factor = super()._setup_downscale_factor(image_filenames, present, *others)
+        remaining = iter(smaller)
+        masks = []
+        for mask in mask_filenames:
+            if mask != NO_MASK:
+                mask = next(remaining)
+            masks.append(mask)
+        return images, masks, depths, factor
 
     def _load_3D_points(self, colmap_path: Path, transform_matrix: Tensor, scale_factor: float) -> dict[str, Tensor]:
         matches = {}

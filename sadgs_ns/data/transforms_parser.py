@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sadgs_ns.data import colmap, ply
+from sadgs_ns.data.images import NO_MASK
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, transforms_path
 from sadgs_ns.data.run_frame import (
     POINTS_FILE,
@@ -65,7 +66,7 @@ class TransformsParser(Nerfstudio):
         frames = self._sort_by_file(meta["frames"], folder)
         images = self._files(frames, "file_path", "images_", folder)
         _check_intrinsics(frames)
-        masks = self._files(frames, "mask_path", "masks_", folder)
+        masks = self._masks(frames, folder)
         depths = self._files(frames, "depth_file_path", "depths_", folder)
         indices = self._indices(meta, images, split, folder)
         poses, transform, scale = self._place_poses(frames, meta)
@@ -116,6 +117,18 @@ class TransformsParser(Nerfstudio):
             kind = key.split("_")[0]
             raise ValueError(f"Different number of image and {kind} filenames.")
         return files
+
+    def _masks(self, frames: Sequence[dict[str, Any]], folder: Path) -> list[Path]:
+        """Return the mask of each frame, `NO_MASK` for those that name none; none if no frame names one."""
+        if not any("mask_path" in frame for frame in frames):
+            return []
+        masks = []
+        for frame in frames:
+            mask = NO_MASK
+            if "mask_path" in frame:
+                mask = self._get_fname(Path(frame["mask_path"]), folder, "masks_")
+            masks.append(mask)
+        return masks
 
     def _indices(self, meta: dict[str, Any], images: Sequence[Path], split: str, folder: Path) -> NDArray[np.integer]:
         """Return the indices of the images in a split, which the file lists, or by the parser's options."""

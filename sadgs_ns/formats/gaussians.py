@@ -31,6 +31,7 @@ class Context:
 
     up: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Axis of the Gaussians' frame that is up
     start: Start | None = None  # There if the file is a page
+    title: str = ""  # Of a page
 
 
 DEFAULTS = Context()

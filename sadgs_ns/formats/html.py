@@ -12,6 +12,7 @@ import json
 import math
 import re
 import tempfile
+from html import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,12 +26,16 @@ from sadgs_ns.formats.gaussians import DEFAULTS, Context, Gaussians, Start
 
 _BOOTSTRAP = re.compile(rb'(<script type="application/json" id="sse-bootstrap">)(.*?)(</script>)', re.DOTALL)
 """The page's settings and content."""
+_TITLE = re.compile(rb"<title>.*?</title>")
 _TO_VIEWER = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # From z up to the viewer's frame, in which y is up
 _TO_CONTENT = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])  # From z up to the content's frame, turned half round
 
 
 def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     """Write a page of at least one Gaussian, in a frame in which z is up; it opens at the context's start.
+
+    The viewer's settings hold where the camera begins and what it looks at, and no limits of where it may go: how near
+    and far the mouse takes it is fixed in the viewer.
 
     Raise InputError if Node.js or its package cannot be run.
     """
@@ -52,6 +57,9 @@ def write(file: IO[bytes], gaussians: Gaussians, context: Context) -> None:
     if number != 1:
         problem = "PlayCanvas's splat-transform made a page of another kind than this version knows"
         raise InputError(f"{problem}: choose another format.")
+    if context.title:
+        title = f"<title>{escape(context.title)}</title>".encode()
+        page = _TITLE.sub(lambda _: title, page, count=1)
     file.write(page)
 
 
@@ -100,6 +108,12 @@ def _single_gaussian() -> Gaussians:
         features_dc=zeros,
         features_rest=np.zeros((1, 0, 3), np.float32),
     )
+
+
+def middle_camera(positions: NDArray[np.float64]) -> int:
+    """Return which of the cameras at positions [C, 3] stands nearest to their middle, away from the capture's edge."""
+    from_middle = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+    return int(from_middle.argmin())
 
 
 def start_at(camera_to_world: NDArray[np.float64], side: int, focal: float, means: NDArray[np.float32]) -> Start:

@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.programs import Node, find_node
+from sadgs_ns.programs import NEEDED_NODE, Node, find_node
 
 PACKAGES = Path(__file__).parent / "npm"
 """What npm reads: the packages, and their hashes."""
@@ -72,7 +72,7 @@ def _require_node() -> Node:
     """Return Node.js; raise InputError if there is none that is new enough."""
     node = find_node()
     if node is None:
-        raise InputError(f"HTML is written with the help of Node.js 22 or newer, which is not there: {REMEDY}.")
+        raise InputError(f"HTML is written with the help of {NEEDED_NODE}, which are not there: {REMEDY}.")
     return node
 
 

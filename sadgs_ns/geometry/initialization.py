@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
 FACE_GRID = 16
 """Points along each side of a face (released code)."""
+FACES_SHARE = 0.01
+"""Share of the most starting points of `most_starting_points` that may lie on the faces. On a CPU a step draws three
+times as long with all of them on images of 0.01 megapixels."""
+LEAST_POINTS = 1000
+"""Starting points that images of any size may have, without those on the faces."""
 FACE_OPACITY = 0.05
 """Initial opacity of the points on the faces (released code)."""
 POINT_OPACITY = 0.1
@@ -47,6 +54,25 @@ def bounding_box_points(
     return placed, spacing
 
 
+def most_starting_points(pixels: int, per_pixel: float) -> float:
+    """Return how many points training may start from, given all training images' pixels; infinity if 0 a pixel."""
+    if per_pixel == 0:
+        return math.inf
+    return max(per_pixel * pixels, LEAST_POINTS)
+
+
+def face_grid(pixels: int, per_pixel: float) -> int:
+    """Return how many points there are along each side of a face, 2 to `FACE_GRID`, given all training images' pixels.
+
+    Points on the faces are large, and images of few pixels hardly show them.
+    """
+    if per_pixel == 0:
+        return FACE_GRID
+    most = FACES_SHARE * per_pixel * pixels
+    grid = math.isqrt(int(most / 6))
+    return min(max(grid, 2), FACE_GRID)
+
+
 def neighbour_scales(
     points: Tensor,  # [P, 3]
 ) -> Tensor:
@@ -82,6 +108,7 @@ def starting_points(
     *,
     faces: bool,
     opacity: float = POINT_OPACITY,
+    grid: int = FACE_GRID,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return the points that training starts from, with the scale and opacity of each.
 
@@ -90,6 +117,7 @@ def starting_points(
         colors: In [0, 1]. [P, 3]
         faces: Whether `bounding_box_points` are added.
         opacity: Of the given points.
+        grid: Points along each side of a face.
 
     Returns:
         Points and colours, [N, 3] each, and scales in world units, > 0, and opacities, [N] each.
@@ -101,7 +129,7 @@ def starting_points(
     opacities = torch.full((len(points),), opacity)
     if not faces:
         return points, colors, scales, opacities
-    added, spacing = bounding_box_points(points)
+    added, spacing = bounding_box_points(points, grid)
     grey = torch.full_like(added, FACE_GREY)
     spacings = torch.full((len(added),), spacing)
     faint = torch.full((len(added),), FACE_OPACITY)

@@ -119,15 +119,18 @@ RULES: dict[str, Rule] = {
     "structure": Rule(lambda windows: windows.structure_every, structure_aware, reads="statistics"),
     "absgs": Rule(lambda windows: windows.absgs_every, absgs, reads="gradients"),
 }
-"""The rules by their names. Where several are due, the first of them takes the place of the others."""
+"""The rules by their names. Those that are due together share the step's budget, in this order."""
 
 
-def due_rule(iteration: int, windows: Windows) -> Rule | None:
-    """Return the rule whose step ends an iteration inside the densification window, or None."""
-    for rule in RULES.values():
-        if due(iteration, rule.every(windows)):
-            return rule
-    return None
+def due_rules(iteration: int, windows: Windows) -> list[Rule]:
+    """Return the rules that are asked at the end of an iteration inside the densification window.
+
+    A step reads one part of the state: the first due rule that reads a part takes the place of those of the other
+    part. So a structure step takes the place of an AbsGS step.
+    """
+    rules = [rule for rule in RULES.values() if due(iteration, rule.every(windows))]
+    parts = [rule.reads for rule in rules if rule.reads is not None]
+    return [rule for rule in rules if rule.reads is None or rule.reads == parts[0]]
 
 
 @torch.no_grad()

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rule, structure_aware
+from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rules, structure_aware
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -132,7 +132,7 @@ class RunningStrategy(Strategy):
             if rule.reads is None:
                 continue
             iteration = next_due(first, rule.every(windows))
-            # Of rules that are due at once, the first one acts.
+            # Of rules that are due at once, the first one says which part of the state the step reads.
             if iteration < soonest:
                 soonest = iteration
                 reads = rule.reads
@@ -150,7 +150,7 @@ class RunningStrategy(Strategy):
             return True
         if due(iteration, windows.reset_every):
             return True
-        return due_rule(iteration, windows) is not None
+        return len(due_rules(iteration, windows)) > 0
 
     def _is_inside(self, iteration: int) -> bool:
         windows = self.windows
@@ -173,12 +173,12 @@ class RunningStrategy(Strategy):
         if not self._is_inside(iteration):
             return
         views = _views(info)
-        rule = due_rule(iteration, self.windows)
-        by_eta = rule is not None and rule.reads == "statistics"
-        if rule is not None and by_eta:
-            self._structure_step(rule, params, optimizers, state, iteration, views)
-        elif rule is not None:
-            self._growth_step(rule, params, optimizers, state, iteration, views)
+        rules = due_rules(iteration, self.windows)
+        by_eta = any(rule.reads == "statistics" for rule in rules)
+        if by_eta:
+            self._structure_step(rules, params, optimizers, state, iteration, views)
+        elif rules:
+            self._growth_step(rules, params, optimizers, state, iteration, views)
         if iteration == self.windows.refine_stop_iter:
             # A structure step has pruned, and its children are fainter than what it kept.
             if not by_eta:
@@ -223,7 +223,7 @@ class RunningStrategy(Strategy):
     # --- parts of a densification step ---
 
     def _structure_step(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
         """Prune by η, let Gaussians grow by it, and empty the state."""
         num_before = len(params["means"])
@@ -235,27 +235,53 @@ class RunningStrategy(Strategy):
             faint = max(faint, FINAL_PRUNE_OPACITY)
         num_pruned = self._prune(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
         map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
-        proposal, allowed = self._grow(rule, params, optimizers, state, iteration, views)
+        num_violating, num_grown = self._grow(rules, params, optimizers, state, iteration, views)
         _empty_state(params, state)  # Children have no observations yet.
-        num_violating = int((proposal.growth > 0).sum())
         names = ("before", "violating", "low", "split", "pruned", "after")
-        numbers = (num_before, num_violating, num_low, int(allowed.sum()), num_pruned, len(params["means"]))
+        numbers = (num_before, num_violating, num_low, num_grown, num_pruned, len(params["means"]))
         of_all = dict(zip(names, self.world.sums(*numbers), strict=True))
         state.setdefault("structure_steps", []).append({"iteration": iteration, **of_all})
 
     def _growth_step(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
     ) -> None:
-        """Let Gaussians grow by a rule that does not read η, prune the faint, and empty the gradients it has read."""
-        self._grow(rule, params, optimizers, state, iteration, views)
+        """Let Gaussians grow by rules that do not read η, prune the faint, and empty the gradients that were read."""
+        self._grow(rules, params, optimizers, state, iteration, views)
         self._prune(params, optimizers, state, self.options.min_opacity)
-        if rule.reads == "gradients":
+        if any(rule.reads == "gradients" for rule in rules):
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _grow(
-        self, rule: Rule, params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+        self, rules: Sequence[Rule], params: Any, optimizers: Any, state: Any, iteration: int, views: Sequence[Info]
+    ) -> tuple[int, int]:
+        """Let Gaussians grow as rules propose, one after the other; each gets an equal share of the room that is left.
+
+        Returns:
+            How many Gaussians of this process violate by η, and how many of these grew.
+        """
+        num_violating = 0
+        num_grown = 0
+        for position, rule in enumerate(rules):
+            num_sharing = len(rules) - position
+            proposal, allowed = self._grow_by(rule, num_sharing, params, optimizers, state, iteration, views)
+            if rule.reads == "statistics":
+                num_violating += int((proposal.growth > 0).sum())
+                num_grown += int(allowed.sum())
+        return num_violating, num_grown
+
+    def _grow_by(
+        self,
+        rule: Rule,
+        num_sharing: int,
+        params: Any,
+        optimizers: Any,
+        state: Any,
+        iteration: int,
+        views: Sequence[Info],
     ) -> tuple[Proposal, Tensor]:
         """Let Gaussians grow as a rule proposes, within the cap and the memory that views like these leave.
+
+        The room is shared with `num_sharing` - 1 rules that are asked afterwards.
 
         Returns:
             The proposal, and which Gaussians grew, bool [N]; N is their number before.
@@ -265,7 +291,8 @@ class RunningStrategy(Strategy):
         in_memory = self._room_in_memory(params, state, views)
         num_present = self.world.sums(len(params["means"]))[0]
         under_cap = self.options.max_gaussians - num_present
-        allowed = limit_growth(self.world, growth, proposal.priority, min(under_cap, in_memory))
+        room = min(under_cap, in_memory)
+        allowed = limit_growth(self.world, growth, proposal.priority, room // num_sharing)
         wanted = self.world.sums(int(growth.sum()))[0]
         allowed_by_cap = min(wanted, under_cap)
         if in_memory < allowed_by_cap:

@@ -14,7 +14,14 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
-from sadgs_ns.data.images import IMAGE_SUFFIXES, UNREADABLE, UNSTITCHED_SUFFIXES, VIDEO_SUFFIXES, image_size
+from sadgs_ns.data.images import (
+    IMAGE_SUFFIXES,
+    UNREAD_SUFFIXES,
+    UNREADABLE,
+    UNSTITCHED_SUFFIXES,
+    VIDEO_SUFFIXES,
+    image_size,
+)
 from sadgs_ns.data.layouts import automatic_options
 from sadgs_ns.data.transforms import frames_of, mended_name, read_json
 from sadgs_ns.errors import InputError
@@ -27,8 +34,6 @@ _FORMATS = COLMAP_FORMATS | {"WEBP", "AVIF", "HEIF"}
 _LONGEST_NAME = 255 - len(".jpg.png")  # Bytes of a name to which a conversion and its mask add these suffixes
 _UNSTITCHED = "files of 360° cameras (stitch them to panoramas or films of 2:1 with the camera's program)"
 _NOT_READ = "images that are not read (make them .jpg or .png files)"
-_RAW_OR_HEIC = {".heic", ".heif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-"""Suffixes of HEIC and raw files. Programs also give them to JPEG; Pillow takes previews of some for TIFF."""
 _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|lost\+found)/.*", re.IGNORECASE)
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
@@ -81,8 +86,25 @@ def _visible_files(folder: Path) -> list[str]:
     """Return the names of all files and broken links in a folder, sorted, without hidden ones, as macOS writes them.
 
     Folders that cannot be read are among them. Links to folders are followed, unless they lead to what is read anyway.
+    Git repositories, results and runs in the folder are not looked into.
     """
+    return _walk(folder)[0]
+
+
+def is_result(folder: Path) -> bool:
+    """Tell whether `sadgs` made a folder."""
+    return (folder / "settings.json").is_file() and ((folder / "training").is_dir() or (folder / "log").is_dir())
+
+
+def _is_foreign(folder: Path) -> bool:
+    """Tell whether a folder is a git repository, a result of `sadgs`, or a run of nerfstudio."""
+    return (folder / ".git").exists() or is_result(folder) or (folder / "nerfstudio_models").is_dir()
+
+
+def _walk(folder: Path) -> tuple[list[str], list[str]]:
+    """Return the names of visible files in a folder, and of the folders in it that are not looked into, both sorted."""
     paths = list[Path]()
+    foreign = list[Path]()
     unread = list[OSError]()
     top = Path(os.path.realpath(folder))
     seen = {top, *top.parents}
@@ -90,11 +112,15 @@ def _visible_files(folder: Path) -> list[str]:
         paths += (path for path in (Path(parent, name) for name in files) if path.is_file() or not path.exists())
         real = {name: Path(os.path.realpath(Path(parent, name))) for name in folders}
         inner = {name for name in folders if Path(parent, name).is_symlink() and top in real[name].parents}
-        folders[:] = [name for name in folders if real[name] not in seen and name not in inner]
+        entered = [name for name in folders if real[name] not in seen and name not in inner]
+        others = [name for name in entered if _is_foreign(Path(parent, name))]
+        foreign += (Path(parent, name) for name in others)
+        folders[:] = [name for name in entered if name not in others]
         seen |= {real[name] for name in folders}
     paths += (Path(error.filename) for error in unread)
     names = (path.relative_to(folder).as_posix() for path in sorted(paths))
-    return [name for name in names if "/." not in f"/{name}"]
+    left = (path.relative_to(folder).as_posix() for path in sorted(foreign))
+    return [name for name in names if "/." not in f"/{name}"], [name for name in left if "/." not in f"/{name}"]
 
 
 def images_of(cameras: Path, folder: Path) -> list[str]:
@@ -127,7 +153,7 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
         pi_heif.register_heif_opener()  # Pillow then reads HEIC, but not where poses are given: training would not.
     folder = Path(os.path.realpath(source))
     scene = Path(os.path.realpath(out))
-    files = _visible_files(folder)
+    files, foreign = _walk(folder)
     settings = [folder / name for name in files if Path(name).parts[1:][-2:] == ("work", "settings.json")]
     scenes = {scene, *(path.parents[1] for path in settings)}
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
@@ -159,6 +185,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
             masks.setdefault(max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")})), name)
         else:
             found["masks of no photo"].append(name)
+    own = {scene, *scene.parents}
+    found["repositories or results of other work"] = [name for name in foreign if folder / name not in own]
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
     return photos, masks, [f"Left out as {what}: {len(names)}, such as {names[0]}." for what, names in left]
 
@@ -178,7 +206,7 @@ def _kind(path: Path) -> str:
         return "photos"
     with contextlib.suppress(*UNREADABLE), Image.open(path) as image:  # HEIC, AVIF, JPEG XL, or another suffix
         kind = image.format
-    if suffix not in IMAGE_SUFFIXES | _RAW_OR_HEIC:
+    if suffix not in IMAGE_SUFFIXES | UNREAD_SUFFIXES:
         return _NOT_READ if kind in _FORMATS | {"GIF", "JPEG2000", "PSD", "PPM"} else ""
     return "photos" if kind in _FORMATS - {"TIFF"} else _NOT_READ
 
@@ -186,7 +214,7 @@ def _kind(path: Path) -> str:
 def _stem(name: str) -> str:
     """Return the part of a photo's name that its mask and copies share."""
     stem = Path(_VARIANT.sub("", Path(name).stem.lower()))
-    return stem.stem if stem.suffix in IMAGE_SUFFIXES | _RAW_OR_HEIC else stem.name
+    return stem.stem if stem.suffix in IMAGE_SUFFIXES | UNREAD_SUFFIXES else stem.name
 
 
 def _is_mask(path: Path) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import os
 import shutil
+import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -88,7 +89,9 @@ def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
         groups, alike = _group_by_camera(scene, converted)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         arguments = (folder, groups, matching, scene.options.max_size, scene.model, scene.base, rigs, alike)
-        summary = Summary(**make_model(colmap, *arguments, folder=scene.work, report=report))
+        longest_side = int(statistics.median(max(photo.size) for photo in photos))
+        made = Summary(**make_model(colmap, *arguments, folder=scene.work, report=report))
+        summary = dataclasses.replace(made, longest_side=longest_side)
         publish(scene.work / "undistorted", scene.options.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
             shutil.rmtree(scene.model)

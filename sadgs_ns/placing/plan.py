@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sadgs_ns.data.images import SMALL_PHOTO
+
 EXHAUSTIVE_LIMIT = 40  # Most photos for which every pair is matched; twice the photos take four times as long
 NEIGHBORS = 20  # Photos that each of more photos is matched with at least, those that look most alike (docs/results.md)
 Matching = Literal["auto", "exhaustive", "sequential", "similar"]
@@ -23,6 +25,7 @@ class Summary:
     attempts: str = ""  # A sentence on a second attempt to place the cameras, if one was made
     doubts: list[str] = field(default_factory=list)  # Reasons why the cameras may be wrong, as in `Judgement`
     faults: list[str] = field(default_factory=list)  # Reasons why they are wrong
+    longest_side: int = 0  # Of the median photo, px; 0 if an earlier version made the scene
 
     def __str__(self) -> str:
         registered = f"{self.registered} of {self.photos} photos registered, {self.points:,} points"
@@ -36,6 +39,13 @@ class Summary:
     def is_poor(self) -> bool:
         """Whether fewer than half of the photos registered, or the cameras are wrong."""
         return self.registered < 0.5 * self.photos or bool(self.faults)
+
+    @property
+    def larger_photos(self) -> str:
+        """The remedy for photos that are so small that they show few features, as a part of a sentence, or ""."""
+        if not 0 < self.longest_side < SMALL_PHOTO:
+            return ""
+        return f"the photos in their original size, since these are {self.longest_side} px wide and show few features"
 
 
 def choose_matching(asked: Matching, photos: int, is_video: bool) -> Matching:

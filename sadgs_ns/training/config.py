@@ -20,7 +20,6 @@ from nerfstudio.configs.base_config import (
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
-from tyro.conf import Suppress
 
 from sadgs_ns.data.parsers import AnyParserConfig, AutomaticDataParserConfig
 from sadgs_ns.errors import InputError, reason
@@ -32,7 +31,7 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import ENERGY_BLUR, FREQUENCY_CONSTANT
 from sadgs_ns.render.rasterization import choose_backend
 from sadgs_ns.render.types import BackendName
-from sadgs_ns.training.options import check_ranges, fill_missing, hide
+from sadgs_ns.training.options import Hidden, check_ranges, check_unused, fill_missing, hide
 from sadgs_ns.training.run import processes
 from sadgs_ns.training.run.progress import ProgressTable
 from sadgs_ns.training.run.run_folder import begin
@@ -40,6 +39,26 @@ from sadgs_ns.training.step.optimizers import FusedAdam, RunLengthDecayScheduler
 
 _MOST_RANDOM = 10_000_000  # Most random points to start from: they take the host's memory before the cap thins them out
 _WIDEST_BLUR = 100  # Largest window of `energy_blur`, which makes kernels of thousands of pixels
+_EVERY_VIEW = "ns-eval and steps_per_eval_all_images measure every held-out view"
+_CACHED = "cache_images says where images and masks are kept"
+_UNUSED = {
+    "": {
+        "prompt": "a capture is trained on its photos, not on a text",
+        "relative_model_dir": "other commands look for checkpoints in nerfstudio_models",
+    },
+    "machine.": dict.fromkeys(("machine_rank", "dist_url"), "torchrun starts runs on several machines, and sets these"),
+    "viewer.": {"num_rays_per_chunk": "Gaussians are drawn without rays"},
+    "pipeline.datamanager.": {
+        "train_cameras_sampling_seed": "machine.seed sets it",
+        "fps_reset_every": "each view is taken once a round",
+        "masks_on_gpu": _CACHED,
+        "images_on_gpu": _CACHED,
+        "eval_num_images_to_sample_from": _EVERY_VIEW,
+        "eval_num_times_to_repeat_images": _EVERY_VIEW,
+        "eval_image_indices": _EVERY_VIEW,
+    },
+}
+"""nerfstudio's options that nothing reads in a run of ours, by what precedes their names, and why."""
 
 
 def _class(module: str, name: str) -> type:
@@ -78,6 +97,9 @@ class SadgsModelConfig(InstantiateConfig):
     """Side of the cube around the origin in which random points are drawn, in the run's units."""
     bounding_box_points: bool = True
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
+    starts_per_pixel: Hidden[float] = 0.02
+    """Most points to start from for each pixel of all training images, which only small images reach.
+    A hundredth of them may lie on the bounding box; 0 sets no limit, as in the paper."""
     stereo_points: int | None = None
     """Largest number of points that are drawn from stereo depth of the training photos and added to the start (CUDA).
     None is 150,000 if there are 3 to 60 training views, and otherwise 0."""
@@ -110,7 +132,7 @@ class SadgsModelConfig(InstantiateConfig):
     exposure: Literal["auto", "off"] = "off"
     """Whether photos are compared with renderings at their own exposure if exposure varies between them ("auto").
     Their gains come from the colours of common SfM points, or from EXIF. The splat has the median exposure."""
-    color_corrected_metrics: Suppress[bool] = False
+    color_corrected_metrics: Hidden[bool] = False
     """Also report metrics after fitting the colours of each rendering to its photo, as suits changing exposure."""
 
     def check(self) -> None:
@@ -134,6 +156,7 @@ class SadgsModelConfig(InstantiateConfig):
             ("near_plane", is_near_plane, "viewers, scene, or positive and finite"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
             ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
+            ("starts_per_pixel", 0 <= self.starts_per_pixel < math.inf, "finite and not negative"),
             ("stereo_points", stereo is None or 0 <= stereo <= _MOST_RANDOM, f"in [0, {_MOST_RANDOM:,}]"),
             ("random_scale", 0 < self.random_scale < math.inf, "positive and finite"),
         ]
@@ -159,7 +182,7 @@ class SadgsDatamanagerConfig(FullImageDatamanagerConfig):
     cache_images: Literal["gpu", "cpu", "compressed"] = "gpu"  # type: ignore[assignment]
     """Where the images are kept: "gpu" is the device of training, as long as that leaves enough of its memory free.
     Otherwise it is "cpu", decoded in the host's memory, or "compressed", files that are decoded ahead of their step."""
-    cache_images_type: Suppress[Literal["uint8", "float32"]] = "uint8"
+    cache_images_type: Hidden[Literal["uint8", "float32"]] = "uint8"
     """Images are kept as bytes, as they are in files; another type is refused."""
 
 
@@ -290,7 +313,7 @@ class SadgsTrainerConfig(TrainerConfig):
     seconds_per_save: float = 60.0
     """Seconds from one checkpoint to the next where steps_per_save is 0; 0 makes none before the end.
     The wait is at least 100 times as long as the last checkpoint took."""
-    steps_per_eval_batch: Suppress[int] = 0
+    steps_per_eval_batch: Hidden[int] = 0
     """Steps between losses on a held-out view; 0 is never."""
     steps_per_eval_all_images: int = 0
     """Steps between metrics of all held-out views; 0 is never. `ns-eval` measures them after training."""
@@ -305,7 +328,7 @@ class SadgsTrainerConfig(TrainerConfig):
     """Folder of a run, or of its checkpoints, from which the run goes on."""
     load_config: Path | None = None
     """The config.yml of a run whose options are taken, instead of all others; nerfstudio executes what it says."""
-    logging: Suppress[LoggingConfig] = field(
+    logging: Hidden[LoggingConfig] = field(
         default_factory=lambda: LoggingConfig(
             local_writer=LocalWriterConfig(_target=ProgressTable, enable=True), profiler="none"
         )
@@ -361,6 +384,9 @@ class SadgsTrainerConfig(TrainerConfig):
         check_ranges("logging.", self.logging, [("steps_per_log", self.logging.steps_per_log >= 1, "at least 1")])
         valid = port is None or 1 <= port <= 65535
         check_ranges("viewer.", self.viewer, [("websocket_port", valid, "in [1, 65535]")])
+        parts = (self, self.machine, self.viewer, self.pipeline.datamanager)
+        for part, (prefix, reasons) in zip(parts, _UNUSED.items(), strict=True):
+            check_unused(prefix, part, reasons)
         self._check_machine()
         self._check_rates()
         self.pipeline.check()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,14 +21,39 @@ from rich.progress import track
 from sadgs_ns.data import colmap
 from sadgs_ns.data.cameras import mark_training_views
 from sadgs_ns.data.checks import splits
+from sadgs_ns.data.images import NO_MASK
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError
 from sadgs_ns.training.step.images import LazyImages, thread_count
 
+NUM_PIXELS = "num_pixels"
+"""Key of the number of all training images' pixels in the metadata that the model gets."""
+
+
+class MaskedDataset(InputDataset):
+    """nerfstudio's dataset, in which images without mask have one that hides nothing, beside others with masks."""
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """Return `image` [H, W, 3 or 4] and the data that nerfstudio gives beside it, as `mask` bool [H, W, 1]."""
+        outputs = self._dataparser_outputs
+        if outputs.mask_filenames is None or outputs.mask_filenames[image_idx] != NO_MASK:
+            return super().get_data(image_idx, image_type)
+        plain = copy.copy(self)
+        plain._dataparser_outputs = dataclasses.replace(outputs, mask_filenames=None)
+        plain.mask_color = None
+        data = InputDataset.get_data(plain, image_idx, image_type)
+        height, width = data["image"].shape[:2]
+        return data | {"mask": torch.ones((height, width, 1), dtype=torch.bool)}
+
 
 class SadgsDatamanager(FullImageDatamanager[InputDataset]):
     """Loads images in threads or on demand. Raises InputError for wrong names or sizes."""
+
+    @cached_property
+    def dataset_type(self) -> type[InputDataset]:
+        """The dataset of training and of held-out views."""
+        return MaskedDataset
 
     def __init__(self, config: FullImageDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
         config = copy.copy(config)  # The original is written to config.yml.
@@ -41,6 +68,8 @@ class SadgsDatamanager(FullImageDatamanager[InputDataset]):
         config.cache_images = "cpu"
         super().__init__(config, *args, **kwargs)  # type: ignore[arg-type]
         self.config.cache_images = requested
+        cameras = self.train_dataset.cameras
+        self.train_dataset.metadata[NUM_PIXELS] = int((cameras.width * cameras.height).sum())
         for dataset in (self.train_dataset, self.eval_dataset):
             _make_paths(dataset)
             splits.check_paths(dataset.image_filenames)

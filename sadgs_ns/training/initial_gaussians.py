@@ -6,37 +6,56 @@ harmonics features_dc [N, 3] and features_rest [N, K, 3].
 
 from __future__ import annotations
 
+import math
+
 import torch
 from nerfstudio.models.splatfacto import RGB2SH, num_sh_bases, random_quat_tensor
 from torch import Tensor
 
 from sadgs_ns.geometry.extents import plausible_points
-from sadgs_ns.geometry.initialization import starting_points
+from sadgs_ns.geometry.initialization import FACE_GRID, face_grid, most_starting_points, starting_points
 from sadgs_ns.geometry.outliers import POINT_SHARE, REACH
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.run.progress import warn
 
 
 def initial_gaussians(
-    config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None
+    config: SadgsModelConfig, seed_points: tuple[Tensor, Tensor] | None, pixels: int | None = None
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Return the parameters of N Gaussians at SfM or random points, and which of them are synthetic, bool [N].
 
     `seed_points` are P SfM points [P, 3] and their colours in 0 … 255 [P, 3], if the data has some. Synthetic are all
-    Gaussians that stand for no SfM point. Their number is at most the cap; a warning says what is left out.
+    Gaussians that stand for no SfM point. Their number is at most the cap, and at most `starts_per_pixel` of all
+    training images' `pixels`, if these are known; a warning says what is left out.
     """
+    grid = FACE_GRID
+    most = math.inf
+    if pixels is not None:
+        grid = face_grid(pixels, config.starts_per_pixel)
+        most = most_starting_points(pixels, config.starts_per_pixel)
     if seed_points is None or config.random_init:
+        num_random = int(min(config.num_random, most))
         if not config.random_init:
             warn(
-                f"The data has no SfM points: starting from {config.num_random} random ones in a cube of side "
+                f"The data has no SfM points: starting from {num_random} random ones in a cube of side "
                 f"{config.random_scale}. A reconstruction (sadgs-process) gives a better splat."
             )
-        points = (torch.rand((config.num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
+        points = (torch.rand((num_random, 3)) - 0.5) * config.random_scale  # [P, 3]
         start = starting_points(points, torch.rand((len(points), 3)), faces=False)
         number_of_sfm_points = 0
     else:
         points, colors = _plausible(*seed_points)
-        start = starting_points(points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity)
+        if len(points) > most:
+            warn(
+                f"Starting from a random {int(most):,} of {len(points):,} SfM points, as all training images have "
+                f"{pixels:,} pixels; --pipeline.model.starts-per-pixel 0 takes all."
+            )
+            keep = torch.randperm(len(points))[: int(most)]
+            points = points[keep]
+            colors = colors[keep]
+        start = starting_points(
+            points, colors, faces=config.bounding_box_points, opacity=config.initial_opacity, grid=grid
+        )
         number_of_sfm_points = len(points)
     number = len(start[0])
     cap = config.strategy.max_gaussians

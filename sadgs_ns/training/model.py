@@ -36,6 +36,7 @@ from sadgs_ns.render.tile_forecast import TileForecast
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
+from sadgs_ns.training.datamanager import NUM_PIXELS
 from sadgs_ns.training.exposure_table import ExposureTable
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
 from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
@@ -68,9 +69,9 @@ class SadgsModel(SplatfactoModel):
         config.check()
         self.strategy = config.strategy.for_run(DEFAULT_ITERATIONS)  # Until `follow` sets that of the run.
         self.strategy_state = self.strategy.initialize_state()
-        params, synthetic = initial_gaussians(config, self.seed_points)
-        # Which initial Gaussians are random or on the bounding box, and so stand for no SfM point. bool [N]
-        self.synthetic = synthetic
+        pixels = self.kwargs.get("metadata", {}).get(NUM_PIXELS)
+        params, synthetic = initial_gaussians(config, self.seed_points, pixels)
+        self.synthetic = synthetic  # Those that stand for no SfM point: random ones, and on the bounding box. bool [N]
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
         # nerfstudio's programs ask for one; it does nothing.
         self.camera_optimizer = CameraOptimizerConfig(mode="off").setup(num_cameras=self.num_train_data, device="cpu")

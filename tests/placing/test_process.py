@@ -1186,7 +1186,9 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 @pytest.mark.hard_case(
     "3 of 12 photos register", "a warning with what to do, exit code 1; the features stay for another way of matching"
 )
-def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: Callable[[int], None], capsys):
+def test_a_scene_of_few_of_the_photos_is_warned_of(
+    tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, capsys: Any
+):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     registered(3)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "sequential"]) == 1
@@ -1196,6 +1198,10 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(tmp_path: Path, registered: C
     assert printed.err.startswith("warning: ") and told in printed.err
     assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
     assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
+    remedy = "photos saw. Try another folder with the photos in their original size, since these are "
+    assert remedy in capsys.readouterr().err, "photos of a few px"
+    monkeypatch.setattr("sadgs_ns.placing.plan.SMALL_PHOTO", 8)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
     assert "photos saw. Try another folder with more photos between" in capsys.readouterr().err
     registered(6)
@@ -1785,3 +1791,25 @@ def test_a_scene_among_its_photos_is_none_of_them(tmp_path: Path, monkeypatch, t
     assert main([".", "scene"]) == 130
     black(tmp_path / "scene", "images/a.png", "work/undistorted/images/a.png")
     assert main([".", "scene"]) == 130 and taken == [["a.png", "b.png", "scenery/c.png"]] * 2
+
+
+@pytest.mark.hard_case(
+    "a folder of photos that also holds git repositories, results and runs", "their pictures are left out, and named"
+)
+def test_pictures_of_nested_repositories_and_results_are_no_photos(tmp_path: Path):
+    own = ["a.png", "day 2/b.png", "day 2/c.png"]
+    black(tmp_path, *own)
+    black(tmp_path / "code" / "docs", "logo.png")
+    (tmp_path / "code" / ".git").mkdir()
+    black(tmp_path / "library", "icon.png")
+    (tmp_path / "library" / ".git").write_text("gitdir: ../.git/modules/library")
+    black(tmp_path / "room-splat" / "scene" / "images", "a.jpg")
+    (tmp_path / "room-splat" / "log").mkdir()
+    (tmp_path / "room-splat" / "settings.json").write_text("{}")
+    black(tmp_path / "outputs" / "run" / "renders", "0.png")
+    (tmp_path / "outputs" / "run" / "nerfstudio_models").mkdir()
+    (tmp_path / ".git").mkdir()  # of the photos themselves
+    for scene, number in ((tmp_path / "out", 4), (tmp_path / "room-splat" / "scene", 3)):
+        photos, masks, others = look_into(tmp_path, scene)
+        assert photos == sorted(own) and not masks
+        assert others == [f"Left out as repositories or results of other work: {number}, such as code."]

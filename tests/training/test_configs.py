@@ -6,6 +6,7 @@ import ast
 import copy
 import dataclasses
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -83,12 +84,29 @@ def preset(name: str) -> Any:
     return copy.deepcopy(all_methods[name])
 
 
-def shown_options(method: str, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
-    """Options that `ns-train METHOD --help` shows, without those of the data's parser, and the text beside each."""
-    with pytest.raises(SystemExit) as stopped:
+@pytest.fixture(scope="module")
+def helps() -> dict[str, str]:
+    """What `ns-train METHOD --help` prints, which hides options only in a process that is started for help."""
+    code = f"""
+import contextlib, sys
+sys.argv[:] = ["ns-train", "sadgs", "--help"]
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+for method in {METHODS}:
+    with contextlib.suppress(SystemExit):
         tyro.cli(AnnotatedBaseConfigUnion, args=[method, "--help"])
-    assert stopped.value.code == 0
-    lines = [line.strip("│ ") for line in re.sub(r"\x1b\[[\d;]*m", "", capsys.readouterr().out).splitlines()]
+    print("END")
+"""
+    environment = os.environ | {"CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=HANGS)
+    assert run.returncode == 0, run.stderr
+    return dict(zip(METHODS, run.stdout.split("END\n"), strict=False))
+
+
+def shown_options(method: str, helps: dict[str, str]) -> dict[str, str]:
+    """Options that `ns-train METHOD --help` shows, without those of the data's parser, and the text beside each."""
+    lines = [line.strip("│ ") for line in re.sub(r"\x1b\[[\d;]*m", "", helps[method]).splitlines()]
     options: dict[str, str] = {}
     name = ""
     for line in lines:
@@ -180,8 +198,8 @@ def test_what_splatfacto_s_methods_read_of_its_configuration_is_there():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_the_help_shows_at_most_85_options_each_with_a_sentence(method: str, capsys: pytest.CaptureFixture[str]):
-    options = shown_options(method, capsys)
+def test_the_help_shows_at_most_85_options_each_with_a_sentence(method: str, helps: dict[str, str]):
+    options = shown_options(method, helps)
     beside = [name for name in options if not name.startswith("--pipeline.model.strategy.")]
     assert len(beside) <= 85 - 15, "the strategy has at most 15"
     assert "Hard cap on the number of Gaussians" in options["--pipeline.model.strategy.max-gaussians"]
@@ -190,10 +208,8 @@ def test_the_help_shows_at_most_85_options_each_with_a_sentence(method: str, cap
     assert {name: text for name, text in texts.items() if not re.search(r"\w+ \w+.*\.$", text)} == {}
 
 
-def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only_the_rates(
-    capsys: pytest.CaptureFixture[str],
-):
-    options = shown_options("sadgs", capsys)
+def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only_the_rates(helps: dict[str, str]):
+    options = shown_options("sadgs", helps)
     expected = """
         data output-dir experiment-name vis viewer.websocket-port viewer.websocket-host max-num-iterations
         steps-per-save load-dir load-checkpoint load-config machine.seed machine.device-type machine.num-devices
@@ -202,17 +218,81 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     """
     assert {f"--{name}" for name in expected.split()} <= set(options)
     hidden = re.compile(
-        "warmup|downscale|mixed-precision|logging|accumulation|collider|prompt|eps$|max-norm|weight-decay"
+        "warmup|downscale|mixed-precision|logging|accumulation|collider|prompt|eps$|max-norm|weight-decay|share-url"
     )
     assert [name for name in options if hidden.search(name)] == []
     rates = {name.rpartition(".")[2] for name in options if name.startswith("--optimizers.")}
     assert rates == {"lr", "final-factor"}
 
 
+HIDDEN_OPTIONS = """
+    --project-name mine --viewer.make-share-url True --load-scheduler False --logging.steps-per-log 50
+    --logging.local-writer.max-log-size 0 --steps-per-eval-batch 7 --viewer.camera-frustum-scale 0.2
+    --pipeline.datamanager.max-thread-workers 2 --pipeline.model.color-corrected-metrics True
+    --optimizers.means.optimizer.eps 1e-8 --optimizers.means.scheduler.max-steps 500
+"""
+
+
+def test_options_that_the_help_hides_are_accepted():
+    """nerfstudio's users have them in their commands."""
+    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *HIDDEN_OPTIONS.split()])
+    config.check()
+    assert (config.project_name, config.load_scheduler, config.steps_per_eval_batch) == ("mine", False, 7)
+    assert (config.logging.steps_per_log, config.logging.local_writer.max_log_size) == (50, 0)
+    assert config.viewer.make_share_url and config.viewer.camera_frustum_scale == 0.2
+    assert config.pipeline.datamanager.max_thread_workers == 2 and config.pipeline.model.color_corrected_metrics
+    means = config.optimizers["means"]
+    assert means["optimizer"].eps == 1e-8 and means["scheduler"].max_steps == 500
+
+
+@pytest.mark.hard_case("nerfstudio's options that cannot work here, such as `mixed-precision`", "refused, with why")
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--mixed-precision True", r"mixed_precision must be False, since sadgs trains in float32"),
+        ("--prompt chair", r"prompt has no effect here, since a capture is trained on its photos, not on a text"),
+        ("--relative-model-dir weights", r"relative_model_dir has no effect here, since other commands look for"),
+        ("--machine.machine-rank 1", r"machine\.machine_rank has no effect here, since torchrun starts runs"),
+        ("--machine.num-machines 2", r"machine\.num_machines must be 1, since `torchrun"),
+        ("--viewer.num-rays-per-chunk 64", r"viewer\.num_rays_per_chunk has no effect here, since Gaussians"),
+        ("--pipeline.datamanager.train-cameras-sampling-seed 7", r"sampling_seed .*, since machine\.seed sets it"),
+        ("--pipeline.datamanager.images-on-gpu True", r"images_on_gpu has no effect here, since cache_images says"),
+        ("--pipeline.datamanager.eval-image-indices 3", r"eval_image_indices has no effect here, since ns-eval"),
+        ("--optimizers.means.optimizer.weight-decay 0.1", r"weight_decay must be left out"),
+    ],
+)
+def test_options_that_the_help_hides_and_that_cannot_work_say_why(words: str, sentence: str):
+    config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *words.split()])
+    with pytest.raises(InputError, match=sentence):
+        config.check()
+
+
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
 def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
     texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
     assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+
+
+def test_small_images_bound_the_number_of_starting_points(capsys: pytest.CaptureFixture[str]):
+    """Of 100,000 pixels 2 % are 2,000 points, and the box has the least, 2 × 2 a face; a billion bound nothing."""
+    generator = torch.Generator().manual_seed(0)
+    seed_points = torch.rand((3000, 3), generator=generator), 255 * torch.rand((3000, 3), generator=generator)
+
+    def number(pixels: int | None, **options: Any) -> int:
+        config = dataclasses.replace(SadgsModelConfig(), **options)
+        params, synthetic = initial_gaussians.initial_gaussians(config, seed_points, pixels)
+        assert len(synthetic) == len(params["means"])
+        return len(synthetic)
+
+    assert number(100_000) == 2000 + 6 * 2**2
+    assert "Starting from a random 2,000 of 3,000 SfM points, as all training images have 100,000 px" in (
+        " ".join(capsys.readouterr().out.split()).replace("pixels", "px")
+    )
+    assert number(100_000, random_init=True) == 2000
+    everything = 3000 + 6 * 16**2
+    assert number(10**9) == number(None) == number(100_000, starts_per_pixel=0.0) == everything
+    assert number(10**9, random_init=True) == 50_000
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.hard_case(
@@ -357,7 +437,7 @@ def test_the_papers_presets_are_sadgs_without_what_we_added():
     model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
     model.averaged_share = model.max_angular_scale = 0.0
     model.near_plane = "scene"
-    model.stereo_points, model.clear_paths = 0, False
+    model.stereo_points, model.starts_per_pixel, model.clear_paths = 0, 0.0, False
     model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
     model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
     model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900

@@ -381,7 +381,9 @@ def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataPar
     config.pipeline.model.initial_opacity = 0.4
     config.pipeline.model.bounding_box_points = True
     model = set_up(config).pipeline.model
-    assert sorted({round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()}) == [0.05, 0.4]
+    opacities = [round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()]
+    assert sorted(set(opacities)) == [0.05, 0.4]
+    assert opacities.count(0.05) <= 6 * 2**2, "images of few pixels have few points on the box"
     config.pipeline.model.random_init = True
     model = set_up(config).pipeline.model
     assert {round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()} == {0.1}

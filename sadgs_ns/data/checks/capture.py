@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -18,7 +19,9 @@ from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.checks.findings import Finding, check_findings
 from sadgs_ns.data.checks.geometry import check_times
 from sadgs_ns.data.checks.transforms import check_blender, check_nerfstudio
+from sadgs_ns.data.images import NO_MASK
 from sadgs_ns.data.layouts import ParserOptions
+from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.own_parsers import OWN
 from sadgs_ns.data.parsers import choose_parser
 from sadgs_ns.errors import InputError, reason
@@ -75,12 +78,23 @@ def _parse_on_trial(config: DataParserConfig, data: Path) -> list[Finding]:
             raise
         except Exception as error:
             raise InputError(f"{data} cannot be read by {name} ({_cause(error)}): {remedy}.") from error
+        _check_files([*outputs.image_filenames, *(outputs.mask_filenames or [])], data)
         if split == "train":
             if len(outputs.image_filenames) == 0:
                 raise InputError(f"{name} finds no image to train on in {data}: {remedy}.")
             if outputs.cameras.times is not None:
                 findings += check_times(outputs.cameras.times.flatten().tolist(), data)
     return findings
+
+
+def _check_files(names: Sequence[Path | str], data: Path) -> None:
+    """Raise InputError for the first file that a parser names and that is missing."""
+    files = [Path(name) for name in names]
+    nearby = NearbyFiles(data, files)
+    for file in files:
+        if file != NO_MASK and not file.is_file():
+            problem = nearby.sentence(file) or "does not exist: put it there, or leave it out of the poses"
+            raise InputError(f"{file} {problem}.")
 
 
 def _cause(error: Exception) -> str:

@@ -18,6 +18,7 @@ from sadgs_ns.data.checks.layouts import no_layout
 from sadgs_ns.data.checks.splits import SPLITS, check_splits
 from sadgs_ns.data.colmap_views import read_views
 from sadgs_ns.data.layouts import ParserOptions, automatic_options
+from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.text import read_text
 from sadgs_ns.data.views import View
 from sadgs_ns.errors import InputError
@@ -46,7 +47,7 @@ def check_colmap(data: Path, options: ParserOptions, open_images: bool = True) -
     if open_images:
         factor = yield from _check_factor(folder, names, options)
         frames = _frames(data, options, names, views, factor)
-        yield from check_images(frames, poses_path, look_for_unused=factor == 1)
+        yield from check_images(frames, poses_path, data, look_for_unused=factor == 1)
         views = [view._replace(image=frame.image) for view, frame in zip(views, frames, strict=True)]
     if options.load_3D_points:
         random = f"{this_model} --load-3D-points False` to start from random points"
@@ -76,15 +77,42 @@ def _frames(
     """Return the images, scaled down by a factor, of the views with these names, and their masks."""
     folder = images.smaller_folder(data / options.images_path, factor)
     frames = []
+    masks = {}
+    masks_folder = data
+    if options.masks_path is not None:
+        masks = _masks(data / options.masks_path, names)
+        masks_folder = images.smaller_folder(data / options.masks_path, factor)
     for name, view in zip(names, views, strict=True):
         size = (view.camera.width, view.camera.height)
         size = images.scaled_size(size, factor, options.downscale_rounding_mode)
         mask = None
-        if options.masks_path is not None:
-            masks = data / options.masks_path
-            mask = images.smaller_folder(masks, factor) / images.mask_name(masks, name)
+        if name in masks:
+            mask = masks_folder / masks[name]
         frames.append(images.Frame(folder / name, size, mask))
     return frames
+
+
+def _masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Return the masks of the images that have one, relative to the folder of masks.
+
+    A mask that is nearly called as an image without one counts as missing, as it may be meant. Raise InputError if no
+    image has a mask.
+    """
+    masks = {}
+    for name in names:
+        mask = images.mask_name(folder, name)
+        if mask is not None:
+            masks[name] = mask
+    nearby = NearbyFiles(folder, {folder / mask for mask in masks.values()})
+    for name in names:
+        expected = Path(name).with_suffix(".png")
+        if name not in masks and nearby.find(folder / expected):
+            masks[name] = expected
+    if not masks:
+        expected = folder / Path(names[0]).with_suffix(".png")
+        problem = f"{folder} has no mask of any image, such as {expected}"
+        raise InputError(f"{problem}: put masks there, or leave `--masks-path` out of the command.")
+    return masks
 
 
 def _check_folders(data: Path, options: ParserOptions, names: Sequence[str], poses: Path) -> Iterator[Finding]:
@@ -128,6 +156,10 @@ def _check_factor(folder: Path, names: Sequence[str], options: ParserOptions) ->
     smaller = images.smaller_folder(folder, factor)
     if factor == 1 or all((smaller / name).parent.exists() for name in names):
         return factor
+    missing = next(smaller / name for name in names if not (smaller / name).parent.exists())
+    found = NearbyFiles(smaller).sentence(missing)
+    if found is not None:
+        raise InputError(f"{missing} {found}.")
     if options.downscale_factor is not None:
         problem = f"{smaller} does not exist, which should hold the images scaled down by `--downscale-factor {factor}`"
         scale = f"`--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}`"

@@ -6,16 +6,22 @@ import os
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 from sadgs_ns.data import images
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
+from sadgs_ns.data.nearby import NearbyFiles
 
 _TURN = "turn their pixels as those poses want it, and take the tag away, as ImageMagick's `mogrify -auto-orient` does"
 
 
-def check_images(frames: Sequence[images.Frame], source: Path, look_for_unused: bool = False) -> Iterator[Finding]:
+def check_images(
+    frames: Sequence[images.Frame], source: Path, data: Path, look_for_unused: bool = False
+) -> Iterator[Finding]:
     """Check the images and masks of frames from a source, and say in a note how many and of what kind they are.
+
+    Files that are missing are looked for below the folder of the data. Images without mask beside others with one give
+    a warning with their number.
 
     Images are decoded until one shows something, and masks until one hides a part. If asked, a warning
     tells of images beside the frames' that no frame uses.
@@ -24,8 +30,11 @@ def check_images(frames: Sequence[images.Frame], source: Path, look_for_unused: 
         headers = list(pool.map(images.read_header, (frame.image for frame in frames)))
         masks = list(pool.map(lambda frame: frame.mask and images.read_header(frame.mask), frames))
     problems: dict[str, list[tuple[Path, str]]] = defaultdict(list)
-    for found in filter(None, map(_problem, frames, headers, masks, [source] * len(frames))):
-        problems[found[0]].append(found[1:])
+    nearby = NearbyFiles(data, {frame.image for frame in frames} | {frame.mask for frame in frames if frame.mask})
+    for frame, header, mask in zip(frames, headers, masks, strict=True):
+        found = _problem(frame, header, mask, source, nearby)
+        if found is not None:
+            problems[found[0]].append(found[1:])
     for same in problems.values():
         path, text = same[0]
         yield fault(f"{and_more(path, len(same))} {text}.")
@@ -54,11 +63,15 @@ def _check_unused(frames: Sequence[images.Frame], source: Path) -> Iterator[Find
 
 
 def _check_masks(frames: Sequence[images.Frame], source: Path) -> Iterator[Finding]:
-    """Check that good masks of all frames leave a pixel to train on, and hide one."""
+    """Check that good masks leave a pixel to train on, and hide one, and tell of images without mask beside others."""
     masks = [frame.mask for frame in frames if frame.mask is not None]
-    if not masks or len(masks) < len(frames):
+    if not masks:
         return
-    if all(images.is_uniform_mask(mask, valid=False) for mask in masks):
+    unmasked = [frame.image for frame in frames if frame.mask is None]
+    if unmasked:
+        problem = f"{source} has masks for {len(masks)} of {len(frames)} images"
+        yield warning(f"{problem}: nothing is hidden in the others, such as {unmasked[0]}; add masks if it should be.")
+    elif all(images.is_uniform_mask(mask, valid=False) for mask in masks):
         problem = f"{source} has {len(masks)} masks that are all black, such as {masks[0]}"
         yield fault(f"{problem}, which leaves no pixel to train on: make white what is to be trained on.")
     if all(images.is_uniform_mask(mask, valid=True) for mask in masks):
@@ -92,13 +105,13 @@ def _may_be_turned(image: images.Header) -> bool:
 
 
 def _problem(
-    frame: images.Frame, image: images.Header, mask: images.Header | None, source: Path
+    frame: images.Frame, image: images.Header, mask: images.Header | None, source: Path, nearby: NearbyFiles
 ) -> tuple[str, Path, str] | None:
     """Return the problem of a frame's files, or None: its kind, the file and the rest of the sentence."""
     if image.problem.startswith("does not exist"):
-        similar = _image_of_similar_name(frame.image, source)
-        if similar is not None:
-            return "near", frame.image, f"does not exist, but {similar} does: correct the name, or save that as this"
+        found = nearby.sentence(frame.image)
+        if found is not None:
+            return "near", frame.image, found
     if image.problem:
         return image.problem.split(" (")[0], frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):
@@ -113,22 +126,23 @@ def _problem(
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
     if frame.mask is None or mask is None:
         return None
+    return _mask_problem(frame.image, image, frame.mask, mask, nearby)
+
+
+def _mask_problem(
+    image_path: Path, image: images.Header, path: Path, mask: images.Header, nearby: NearbyFiles
+) -> tuple[str, Path, str] | None:
+    """Return the problem of the mask of a good image, as `_problem` does."""
+    if mask.problem.startswith("does not exist"):
+        found = nearby.sentence(path)
+        if found is not None:
+            return "near mask", path, found
     if mask.problem:
-        return mask.problem.split(" (")[0], frame.mask, mask.problem
+        return mask.problem.split(" (")[0], path, mask.problem
     if mask.mode not in images.GREY_MODES:
-        return "mask mode", frame.mask, f"is a mask of Pillow's mode {mask.mode}: convert it to 8-bit grey"
+        return "mask mode", path, f"is a mask of Pillow's mode {mask.mode}: convert it to 8-bit grey"
     if mask.size != image.size:
-        return "mask", frame.mask, f"is a mask of another size than {frame.image}: resize it"
-    return None
-
-
-def _image_of_similar_name(image: Path, source: Path) -> Path | None:
-    """Return an image that differs from a missing one in its folder, its case or its suffix, or None."""
-    stem = PureWindowsPath(str(image)).stem.lower()  # Windows' paths and names in other case occur.
-    for folder in (image.parent, source.parent / "images", source.parent):
-        for path in images.images_in(folder):
-            if path.stem.lower() == stem:
-                return path
+        return "mask", path, f"is a mask of another size than {image_path}: resize it"
     return None
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from sadgs_ns.data import colmap
-from sadgs_ns.data.images import VIDEO_SUFFIXES, images_in
+from sadgs_ns.data.images import SMALL_PHOTO, VIDEO_SUFFIXES, image_size, images_in
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
+from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.transforms import GIVE_POSES
 
 _BUNDLER = (
@@ -81,8 +83,7 @@ def no_layout(data: Path) -> str:
         return f"{data} is a part of the capture {capture}: give --data that folder."
     kind = colmap.model_kind(data)
     if kind is not None:
-        first = colmap.image_names(data)[:1]
-        return f"{data}/images.{kind} has poses, but its images, such as {first}, are not in {data}: put them there."
+        return _no_images(data, data / f"images.{kind}")
     elsewhere = poses_elsewhere(data)
     if elsewhere is not None:
         return elsewhere
@@ -92,8 +93,7 @@ def no_layout(data: Path) -> str:
         photos = data / "images"
         images = images_in(photos)
     if images:
-        command = f"`sadgs-process {shlex.quote(str(photos))} FOLDER`"
-        return f"{data} holds {len(images)} images but no camera poses: compute them with {command}."
+        return f"{data} holds {len(images)} images but no camera poses: {_remedy_for_photos(photos, images)}."
     capture = _capture_inside(data)
     if capture is not None:
         return f"{data} is no capture, but {capture} in it is one: give --data that folder."
@@ -101,6 +101,26 @@ def no_layout(data: Path) -> str:
         f"{data.absolute()} holds neither transforms.json nor a COLMAP reconstruction ({', '.join(COLMAP_FOLDERS)}): "
         f"give --data another folder, or {GIVE_POSES}."
     )
+
+
+def _remedy_for_photos(folder: Path, images: Sequence[Path]) -> str:
+    """Return the commands for a folder of photos without poses, and what is against these photos."""
+    quoted = shlex.quote(str(folder))
+    remedy = f"`sadgs {quoted}` makes a splat of them, and `sadgs-process {quoted} FOLDER` computes the poses alone"
+    longest = max(image_size(images[len(images) // 2]))
+    if 0 < longest < SMALL_PHOTO:
+        remedy += f"; photos of {longest} px show few features, so give them in their original size"
+    return remedy
+
+
+def _no_images(data: Path, poses: Path) -> str:
+    """Return the sentence for a folder with a reconstruction, without the images of its poses."""
+    names = colmap.image_names(data)
+    for name in names[:1]:
+        found = NearbyFiles(data).sentence(data / name)
+        if found is not None:
+            return f"{poses} has poses, but its image {data / name} {found}."
+    return f"{poses} has poses, but its images, such as {names[:1]}, are not in {data}: put them there."
 
 
 def _no_folder(data: Path) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from sadgs_ns.data.checks.findings import Finding, and_more, warning
 from sadgs_ns.data.layouts import ParserOptions
+from sadgs_ns.data.nearby import similar_name
 from sadgs_ns.errors import InputError
 
 SPLITS = ("train", "val", "test")  # nerfstudio trains on the first, `ns-train` measures the second, `ns-eval` the third
@@ -46,7 +47,11 @@ def check_splits(
         unknown = [name for name in listed if locate(name) not in images]
         if unknown:
             which = and_more(repr(unknown[0]), len(unknown))
-            raise InputError(f"{called(split)} names {which}, which is no image with a pose: correct it.")
+            remedy = "correct it"
+            similar = similar_name(unknown[0], names)
+            if similar is not None:
+                remedy = f"{similar!r} may be meant; {remedy}"
+            raise InputError(f"{called(split)} names {which}, which is no image with a pose: {remedy}.")
         located[split] = set(map(locate, listed))
     training = located["train"]
     tests = located.get("test", set())

@@ -60,7 +60,6 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
         image = locate(frame["file_path"])
         views.append(_view(frame, where, camera_of(frame, model, where), image, open_images))
         frames.append(images.Frame(image, _scaled_size(frame, factor), _mask(frame, locate)))
-    _check_all_or_none(described, "mask_path", "masks", path)
     _check_all_or_none(described, "depth_file_path", "depths", path)
     names = [frame["file_path"] for frame in described]
     lists = {split: meta[f"{split}_filenames"] for split in SPLITS if f"{split}_filenames" in meta}
@@ -72,7 +71,7 @@ def check_nerfstudio(data: Path, options: ParserOptions, open_images: bool = Tru
     if not any("mask_path" in frame for frame in described):
         yield from _check_unnamed_masks(folder / "masks", path)
     if open_images:
-        yield from check_images(frames, path, look_for_unused=factor == 1)
+        yield from check_images(frames, path, folder, look_for_unused=factor == 1)
     if not sound:
         views = []  # Points are then checked without them.
     if options.load_3D_points:
@@ -141,12 +140,27 @@ def _factor_of(described: Sequence[dict[str, Any]], folder: Path, options: Parse
         return factor
     for kind, key in (("images", "file_path"), ("masks", "mask_path")):
         smaller = images.smaller_folder(folder / kind, factor)
-        if key in described[0] and not smaller.is_dir():
+        if any(key in frame for frame in described) and not smaller.is_dir():
             problem = f"{smaller} does not exist, which should hold the {kind} scaled down by {factor}"
             scale = f"--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}"
             remedy = f"make it, or end the command with `{scale} nerfstudio-data --downscale-factor 1`"
             raise InputError(f"{problem}: {remedy}.")
+    _check_copies(described, folder, factor)
     return factor
+
+
+def _check_copies(described: Sequence[dict[str, Any]], folder: Path, factor: int) -> None:
+    """Raise InputError if two frames would read one smaller copy: nerfstudio leaves out the folders of their names."""
+    first_of: dict[Path, str] = {}
+    for frame in described:
+        name = frame["file_path"]
+        copy = _locate(folder, factor, name)
+        first = first_of.setdefault(copy, name)
+        if first != name:
+            problem = f"{copy} would be the copy of both {first} and {name}, whose folders are left out there"
+            scale = f"--pipeline.datamanager.camera-res-scale-factor {1 / factor:.4g}"
+            remedy = f"end the command with `{scale} nerfstudio-data --downscale-factor 1`"
+            raise InputError(f"{problem}: {remedy}.")
 
 
 @collect_findings
@@ -177,7 +191,7 @@ def check_blender(data: Path, options: ParserOptions, open_images: bool = True) 
             yield from geometry.check_rotations(views)
         if open_images:
             frames = [images.Frame(image, size) for image in paths]
-            yield from check_images(frames, path)
+            yield from check_images(frames, path, data)
 
 
 def _blender_views(

@@ -25,6 +25,10 @@ ITERATION_SHARES = (0.0, 0.2, 0.533, 0.75, 1.0)
 TIME_SHARES = (0.0, 0.15, 0.668, 0.817, 1.0)
 """Shares of a run's iterations, and of its time that they take: they are longest while the most Gaussians are there."""
 _DENSIFICATION_END = ITERATION_SHARES[2]  # Share of a run's iterations after which densification is over
+_EARLY_FACTORS = (0.5, 2.0)
+"""Bounds of the time left before that, in times that all iterations take as long as the latest. It was .61 to 1.51 of
+these from 7 to 45 % of the iterations of eight captures on GPUs (docs/results.md)."""
+_EARLY_SECONDS = 60.0  # Shortest time left for which bounds are shown
 _MEASURED_SHARE = 0.35  # Share of a run's time after which the time left is shown; sooner it would be over 30 % off.
 
 
@@ -48,6 +52,27 @@ def duration(seconds: float) -> str:
     if minutes < 100:
         return f"{minutes} min"
     return f"{minutes // 60} h {minutes % 60} min"
+
+
+def duration_between(least: float, most: float) -> str:
+    """Return bounds of a time, ≥ 60 s and far apart, as "40–160 s", "2–8 min" or "0.9–3.4 h"."""
+    if most < 180:
+        return f"{least:.0f}–{most:.0f} s"
+    if most < 100 * 60:
+        return f"{least / 60:.0f}–{most / 60:.0f} min"
+    return f"{least / 3600:.1f}–{most / 3600:.1f} h"
+
+
+def early_time_left(step: int, total: int, pace: float) -> str:
+    """Return bounds of the time left where `time_left` cannot tell it; "" if less than a minute is left.
+
+    The latest iterations took `pace` seconds each. On a CPU this part of a run takes minutes.
+    """
+    at_this_pace = pace * (total - 1 - step)
+    if at_this_pace < _EARLY_SECONDS:
+        return ""
+    least, most = _EARLY_FACTORS
+    return duration_between(least * at_this_pace, most * at_this_pace)
 
 
 def time_left(first: int, step: int, total: int, seconds: float, recent: int = 0, pace: float = 0.0) -> float | None:
@@ -152,7 +177,7 @@ class ProgressTable(LocalWriter):
             shown_pace = f"{pace:.1f} s"
         left = time_left(first_step, step, total, now - first_time, recent_step, pace)
         if left is None:
-            return shown_pace, ""
+            return shown_pace, early_time_left(step, total, pace)
         return shown_pace, duration(left)
 
     def _show(self, row: str) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from sadgs_ns.data.images import valid_pixels
+from sadgs_ns.data.images import NO_MASK, valid_pixels
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.training.run.processes import processes_on_this_machine
 from sadgs_ns.training.step.undistortion import Undistortion
@@ -79,6 +79,8 @@ class LazyImages(Sequence[dict[str, Any]]):
     def __getitem__(self, index: Any) -> Any:
         """Return `image` uint8 [H, W, 3 or 4], undistorted and on the CPU, and perhaps a boolean `mask` [H, W, 1].
 
+        A view without mask has none, as where nothing is hidden.
+
         Raises InputError if image or mask cannot be read, or has another size than its camera.
         """
         name = self._names[index]
@@ -111,7 +113,7 @@ class LazyImages(Sequence[dict[str, Any]]):
     def _load(self, index: int) -> dict[str, Any]:
         """Return an image as nerfstudio loads it, and its boolean `mask` [H, W, 1] if the dataset has masks."""
         data = self._dataset.get_data(index, image_type="uint8")
-        if self._masks is None:
+        if self._masks is None or self._masks[index] == NO_MASK:
             return data
         image: Tensor = data["image"]
         with Image.open(self._masks[index]) as file:

@@ -13,10 +13,9 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
-from tyro.conf import Suppress
 
 from sadgs_ns.kernels import use_triton
-from sadgs_ns.training.options import hide
+from sadgs_ns.training.options import Hidden, hide
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT, leave_out_nonfinite
 from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
 
@@ -178,7 +177,7 @@ class FusedAdamOptimizerConfig(AdamOptimizerConfig):
     _target: type = FusedAdam
     lr: float = 1e-3
     """Learning rate; where there is a schedule, its factors multiply it."""
-    eps: Suppress[float] = 1e-15
+    eps: Hidden[float] = 1e-15
     """Adam adds this to the root of the second moment; as in 3DGS."""
 
 
@@ -197,13 +196,13 @@ class RunLengthDecaySchedulerConfig(SchedulerConfig):
     """Exponential decay over the run, or over its last part, whatever `--max-num-iterations` is."""
 
     _target: type = field(default_factory=lambda: RunLengthDecayScheduler)
-    initial_factor: Suppress[float] = 1.0
+    initial_factor: Hidden[float] = 1.0
     """Learning rate at the first iteration, relative to the optimizer's."""
     final_factor: float = 1.0
     """Learning rate at the last iteration, relative to the optimizer's."""
-    hold_share: Suppress[float] = 0.0
+    hold_share: Hidden[float] = 0.0
     """Share of the run in [0, 1) in which the learning rate stays as at the first iteration."""
-    max_steps: Suppress[int | None] = None
+    max_steps: Hidden[int | None] = None
     """Iterations until `final_factor`; None is the length of the run."""
 
 

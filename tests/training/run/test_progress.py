@@ -27,7 +27,14 @@ from helpers.small_scenes import ITERATIONS
 from sadgs_ns.cli import export
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.run import progress
-from sadgs_ns.training.run.progress import ProgressTable, cpu_notice, duration, remove_tables, time_left
+from sadgs_ns.training.run.progress import (
+    ProgressTable,
+    cpu_notice,
+    duration,
+    early_time_left,
+    remove_tables,
+    time_left,
+)
 
 
 @pytest.fixture
@@ -95,6 +102,24 @@ def test_a_row_tells_loss_psnr_gaussians_pace_and_the_time_that_is_left(
         ["10 (10.00%)", "0.5000", "30.00 dB", "10,000", "400 ms"],
         ["50 (50.00%)", "0.5000", "70.00 dB", "50,000", "2.0 s", "59 s"],
     ]
+
+
+def test_where_minutes_are_left_their_bounds_are_told_from_the_second_row_on(
+    events: list[dict[str, Any]], clock: list[float], capsys: pytest.CaptureFixture[str]
+):
+    table = ProgressTable(LocalWriterConfig())
+    for step, seconds in ((0, 0.0), (10, 40.0)):
+        clock[0] += seconds
+        log(table, events, step)
+    rows = capsys.readouterr().out.splitlines()[2:]
+    assert [row.split("  ")[-1].strip() for row in rows] == ["0 (0.00%)", "3–12 min"]
+
+
+def test_bounds_of_the_time_left_have_one_unit():
+    assert early_time_left(9, 100, 0.5) == "", "less than a minute"
+    assert early_time_left(9, 90, 1.0) == "40–160 s"
+    assert early_time_left(9, 1000, 1.0) == "8–33 min"
+    assert early_time_left(9, 1000, 10.0) == "1.4–5.5 h"
 
 
 def test_after_densification_the_time_left_goes_by_the_latest_rows(
