@@ -28,10 +28,14 @@ def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
     """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr."""
     rows = [row for path in paths for row in results.read(path)]
     found: dict[str, dict[str, list[Result]]] = {}
-    for row in (latest := table.latest(rows)):
+    without = []
+    for row in table.latest(rows):
         if row.get("view_psnr"):
-            found.setdefault(row["scene"], {}).setdefault(row["label"], []).append(row)
-    if without := [row["key"] for row in latest if not row.get("view_psnr")]:
+            of_scene = found.setdefault(row["scene"], {})
+            of_scene.setdefault(row["label"], []).append(row)
+        else:
+            without.append(row["key"])
+    if without:
         print(f"Runs without view_psnr are skipped, {len(without)} of them, such as {without[0]}.", file=sys.stderr)
     return found
 
@@ -41,27 +45,34 @@ def view_names(scene: str, runs: Iterable[Result]) -> list[str]:
 
     Raises ValueError if two runs have different numbers of views, or different names.
     """
-    told = [(len(row["view_psnr"]), row.get("view_names")) for row in runs]
-    names = next((names for _, names in told if names), [str(view) for view in range(told[0][0])])
-    if any(count != len(names) or (others or names) != names for count, others in told):
+    runs = list(runs)
+    numbers = [str(view) for view in range(len(runs[0]["view_psnr"]))]
+    lists = [row["view_names"] for row in runs if row.get("view_names")]
+    names = next(iter(lists), numbers)
+    same_names = all(others == names for others in lists)
+    same_number = all(len(row["view_psnr"]) == len(names) for row in runs)
+    if not same_names or not same_number:
         raise ValueError(f"the runs of {scene} hold out different views; give files of one split at a time.")
     return names
 
 
 def references(runs: Runs) -> list[float]:
     """Return the best label's median over seeds of each view's PSNR in dB, empty without runs."""
-    medians = [[statistics.median(view) for view in _by_view(group)] for group in runs.values()]
+    medians = []
+    for group in runs.values():
+        medians.append([statistics.median(view) for view in _by_view(group)])
     return [max(view) for view in zip(*medians, strict=True)]
 
 
 def collapsed(group: Sequence[Result], reference: Sequence[float]) -> list[tuple[int, Any]]:
     """Return the pairs of a view's number and a seed in which one label's view collapses."""
-    return [
-        (view, row["seed"])
-        for view, best in enumerate(reference)
-        for row in group
-        if round(best - row["view_psnr"][view], 6) >= COLLAPSE  # floats make 30.1 − 27.1 less than 3
-    ]
+    pairs = []
+    for view, best in enumerate(reference):
+        for row in group:
+            difference = round(best - row["view_psnr"][view], 6)  # floats make 30.1 − 27.1 less than 3
+            if difference >= COLLAPSE:
+                pairs.append((view, row["seed"]))
+    return pairs
 
 
 def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[float]) -> str:
@@ -72,15 +83,17 @@ def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[f
     every = [row for group in runs.values() for row in group]
     lines = []
     for i, name in enumerate(names):
-        told = (_known(every, "view_angles", i, ".1f"), _known(every, "view_uncovered", i, ".3f"))
-        lines.append((name, *told, *(_mean_and_deviation(_by_view(group)[i]) for group in runs.values())))
-    text = [f"## {scene}", "", table.grid(("View", "Angle °", "Uncovered", *runs), lines), ""]
+        cells = [_mean_and_deviation(_by_view(group)[i]) for group in runs.values()]
+        lines.append([name, _known_angle(every, i), *cells])
+    text = [f"## {scene}", "", table.grid(["View", "Angle °", *runs], lines), ""]
     for label, group in runs.items():
         median = statistics.median(statistics.fmean(view) for view in _by_view(group))
         lowest, worst = min((psnr, i) for row in group for i, psnr in enumerate(row["view_psnr"]))
-        pairs = [f"{names[i]} (seed {seed})" for i, seed in collapsed(group, reference)]
-        told = f"collapsed: {', '.join(pairs) or 'none'}" if reference else "there is no reference"
-        text.append(f"- {label}: median {median:.2f} dB; worst view {names[worst]}, {lowest:.2f} dB; {told}")
+        verdict = "there is no reference"
+        if reference:
+            pairs = [f"{names[i]} (seed {seed})" for i, seed in collapsed(group, reference)]
+            verdict = f"collapsed: {', '.join(pairs) or 'none'}"
+        text.append(f"- {label}: median {median:.2f} dB; worst view {names[worst]}, {lowest:.2f} dB; {verdict}")
     return "\n".join(text)
 
 
@@ -88,14 +101,25 @@ def _by_view(group: Sequence[Result]) -> list[tuple[float, ...]]:
     return list(zip(*(row["view_psnr"] for row in group), strict=True))
 
 
-def _known(rows: Iterable[Result], field: str, view: int, form: str) -> str:
-    values = [row[field][view] for row in rows if row.get(field) and row[field][view] is not None]
-    return format(statistics.median(values), form) if values else "–"
+def _known_angle(rows: Iterable[Result], view: int) -> str:
+    """The median of the angles in degrees that rows have of a view."""
+    angles = []
+    for row in rows:
+        angle = None
+        if row.get("view_angles"):
+            angle = row["view_angles"][view]
+        if angle is not None:
+            angles.append(angle)
+    if not angles:
+        return table.NOTHING
+    return f"{statistics.median(angles):.1f}"
 
 
 def _mean_and_deviation(values: Sequence[float]) -> str:
-    deviation = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):.2f}{deviation}"
+    mean = f"{statistics.fmean(values):.2f}"
+    if len(values) < 2:
+        return mean
+    return f"{mean} ± {statistics.stdev(values):.2f}"
 
 
 @dataclass
@@ -110,7 +134,9 @@ class Command:
     def __call__(self) -> int:
         counts: dict[str, tuple[int, int]] = {}  # collapsed pairs, and all that have a reference
         scenes = load(self.results)
-        frozen = load(self.references) if self.references else scenes
+        frozen = scenes
+        if self.references:
+            frozen = load(self.references)
         for scene, runs in scenes.items():
             others = frozen.get(scene, {})
             names = view_names(scene, [row for group in (*runs.values(), *others.values()) for row in group])
@@ -118,7 +144,9 @@ class Command:
             print(markdown(scene, runs, names, reference), end="\n\n")
             for label, group in runs.items():
                 bad, judged = counts.get(label, (0, 0))
-                counts[label] = bad + len(collapsed(group, reference)), judged + len(group) * len(reference)
+                bad += len(collapsed(group, reference))
+                judged += len(group) * len(reference)
+                counts[label] = (bad, judged)
         for label, (bad, judged) in counts.items():
             print(f"{label}: {bad} of {judged} (view, run) pairs collapsed")
         return 0
