@@ -26,7 +26,7 @@ from benchmarks.side_by_side import devices_of, environment_of, run_side_by_side
 from benchmarks.table import markdown
 
 COMMANDS = {
-    "table": ("table:Command", "the table of a results file, and a plot of quality against time"),
+    "table": ("table_command:Command", "the table of a results file, and a plot of quality against time"),
     "views": ("view_table:Command", "the PSNR of each held-out view, and where it is far below"),
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
     "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
@@ -34,6 +34,7 @@ COMMANDS = {
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
     "cameras": ("cameras:Command", "how accurately cameras are placed, with several seeds and losses"),
+    "seconds": ("seconds:Command", "what a user waits for: the parts of a command side by side"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
 }
@@ -45,9 +46,12 @@ Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 
 def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
     """What a process that has ended measured; the output of one that failed goes to the log."""
-    written, output = folder / "result.json", folder / "log"
+    written = folder / "result.json"
+    output = folder / "log"
     error = f"the run ended with code {code} and no result; see {log}."
-    measured = json.loads(written.read_text()) if written.exists() else {"status": "failed", "error": error}
+    measured = {"status": "failed", "error": error}
+    if written.exists():
+        measured = json.loads(written.read_text())
     if measured["status"] == "failed" and output.exists():
         with log.open("a") as file:
             file.write(f"=== {job.key}\n{output.read_text(errors='replace')}\n")
@@ -104,12 +108,13 @@ def line(result: Result) -> str:
     name = f"{result['scene']} {result['label']} seed {result['seed']}"
     if result["status"] != "ok":
         return f"{name}: failed: {result['error']}"
-    lpips = "" if result["lpips"] is None else f", LPIPS {result['lpips']:.4f}"
-    peak = "" if result["peak_gb"] is None else f", {result['peak_gb']:.2f} GB"
-    return (
-        f"{name}: loop {result['loop_seconds']:.1f} s, PSNR {result['psnr']:.2f}, SSIM {result['ssim']:.4f}{lpips}, "
-        f"{result['gaussians']:,} Gaussians{peak}"
-    )
+    parts = [f"loop {result['loop_seconds']:.1f} s", f"PSNR {result['psnr']:.2f}", f"SSIM {result['ssim']:.4f}"]
+    if result["lpips"] is not None:
+        parts.append(f"LPIPS {result['lpips']:.4f}")
+    parts.append(f"{result['gaussians']:,} Gaussians")
+    if result["peak_gb"] is not None:
+        parts.append(f"{result['peak_gb']:.2f} GB")
+    return f"{name}: {', '.join(parts)}"
 
 
 @dataclasses.dataclass
@@ -158,7 +163,9 @@ class Benchmark:
         if self.gate is not None:
             gate.read(self.gate)  # its errors now rather than after hours
         jobs = self.selected()
-        gpus = self.gpus.split(",") if self.gpus else (None,)
+        gpus: Sequence[str | None] = (None,)
+        if self.gpus:
+            gpus = self.gpus.split(",")
         devices = {max(len(devices_of(gpu)), 1) for gpu in gpus}
         done = results.read(self.output, missing_ok=True)
         devices |= {result["devices"] for result in done if result.get("devices") is not None}
@@ -192,14 +199,20 @@ class Benchmark:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a protocol or one of COMMANDS, and return its exit code, 2 if the input is wrong."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    name, target, kind = "python -m benchmarks", words[0] if words else "", Benchmark
-    others = "\n".join(f"  {other}: {what}" for other, (_, what) in COMMANDS.items())
-    description = f"{Benchmark.__doc__} Other commands, each with --help:\n\n{others}"
-    if target in COMMANDS:
+    if argv is None:
+        argv = sys.argv[1:]
+    name = "python -m benchmarks"
+    words = list(argv)
+    if words and words[0] in COMMANDS:
+        target = words.pop(0)
+        name = f"{name} {target}"
         module, _, attribute = COMMANDS[target][0].partition(":")
-        kind, description = getattr(importlib.import_module(f"benchmarks.{module}"), attribute), None
-        name, words = f"{name} {target}", words[1:]
+        kind = getattr(importlib.import_module(f"benchmarks.{module}"), attribute)
+        description = None
+    else:
+        kind = Benchmark
+        others = "\n".join(f"  {other}: {summary}" for other, (_, summary) in COMMANDS.items())
+        description = f"{Benchmark.__doc__} Other commands, each with --help:\n\n{others}"
     command = tyro.cli(kind, prog=name, description=description, args=words, config=(tyro.conf.FlagCreatePairsOff,))
     try:
         return command()

@@ -21,8 +21,10 @@ from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 STEPS = 60
-FIRST_PIXELS, LAST_PIXELS = 0.2, 0.01
-"""How far the first and the last step move the image, in px, about; together up to 4 px."""
+FIRST_PIXELS = 0.2
+"""How far the first step moves the image, in px, about; all steps together up to 4 px."""
+LAST_PIXELS = 0.01
+"""How far the last step moves the image, in px, about."""
 SSIM_WEIGHT = 0.2  # Of the loss, as in 3DGS
 
 

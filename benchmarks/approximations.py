@@ -30,15 +30,20 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 AXIS_LENGTHS = (3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)
 """Axes ‖v‖ in px whose η > 1 decision is compared at every pixel; c = 0.4 has no wavelength under 2.5 px."""
-SAMPLES, QUADRATURE_POINTS, FOOTPRINTS = (1, 4, 16), 1024, 5000
-"""Of a footprint, of its exact average, and how many footprints there are."""
+SAMPLES = (1, 4, 16)
+"""Numbers of samples of a footprint that are compared."""
+QUADRATURE_POINTS = 1024
+"""Number of points of a footprint's exact average."""
+FOOTPRINTS = 5000
+"""Number of footprints."""
 Row = dict[str, Any]
 """`table`, `variant`, and the numbers of that table's columns."""
 
 
 def timed(function: Callable[[], Any], repeats: int) -> tuple[Any, float]:
     """What a function returns, and the median milliseconds of `repeats` calls after a first one."""
-    result, seconds = function(), []
+    result = function()
+    seconds = []
     for _ in range(repeats):
         start = time.process_time()
         function()
@@ -56,7 +61,8 @@ def spread(errors: Tensor) -> Row:
 def map_errors(tensor: Tensor, reference: Tensor) -> Row:
     """Errors |Λ / Λ_ref − 1| of the wavelength over the pixels of S̄, both [B, H, W, 3], and `flips`, the share of
     pixels × AXIS_LENGTHS on the other side of η = 1."""
-    actual, expected = wavelength(tensor.double()), wavelength(reference.double())  # [B, H, W]
+    actual = wavelength(tensor.double())  # [B, H, W]
+    expected = wavelength(reference.double())  # [B, H, W]
     lengths = torch.tensor(AXIS_LENGTHS, dtype=actual.dtype, device=actual.device).view(-1, 1, 1, 1)
     flips = ((lengths / actual > HIGH_ETA) != (lengths / expected > HIGH_ETA)).double().mean()
     return {**spread((actual / expected - 1).abs()), "flips": float(flips)}
@@ -107,7 +113,8 @@ def random_footprints(count: int, images: Tensor) -> Footprints:
     x, y, size, ratio, turn, image = torch.rand((6, count), generator=generator)
     major = 32.0**size  # log-uniform
     minor = major * 8.0**-ratio
-    cos, sin = (math.pi * turn).cos(), (math.pi * turn).sin()
+    cos = (math.pi * turn).cos()
+    sin = (math.pi * turn).sin()
     axes = torch.stack([major * cos, major * sin, -minor * sin, minor * cos], -1).view(count, 2, 2)
     return Footprints((image * batch).long(), torch.stack([x * width, y * height], -1), axes)
 
@@ -117,7 +124,8 @@ def average(tensors: Tensor, footprints: Footprints, positions: Iterator[Tensor]
 
     Returns the averages, 0 outside [M, 3], and whether any point lies in the image, bool [M].
     """
-    total, count = tensors.new_zeros((len(footprints.means2d), 3)), tensors.new_zeros(len(footprints.means2d))
+    total = tensors.new_zeros((len(footprints.means2d), 3))
+    count = tensors.new_zeros(len(footprints.means2d))
     for points in positions:
         values, inside = sample_map(tensors, footprints.image_ids, points)
         total += values
@@ -128,14 +136,16 @@ def average(tensors: Tensor, footprints: Footprints, positions: Iterator[Tensor]
 def quadrature(footprints: Footprints) -> Iterator[Tensor]:
     """The points of a sunflower spiral that covers each 2σ ellipse evenly. [M, 2] each"""
     for i in range(QUADRATURE_POINTS):
-        radius, angle = 2 * math.sqrt((i + 0.5) / QUADRATURE_POINTS), i * (math.pi * (3 - math.sqrt(5)))
+        radius = 2 * math.sqrt((i + 0.5) / QUADRATURE_POINTS)
+        angle = i * (math.pi * (3 - math.sqrt(5)))
         disc = torch.tensor([radius * math.cos(angle), radius * math.sin(angle)]).to(footprints.axes)
         yield footprints.means2d + disc @ footprints.axes
 
 
 def footprint_rows(tensors: Tensor, footprints: Footprints, repeats: int) -> Iterator[Row]:
     """η by few jittered samples, of which training takes one, against η by the exact average of S̄ [B, H, W, 3]."""
-    conics, generator = footprints.conics, torch.Generator(tensors.device).manual_seed(0)
+    conics = footprints.conics
+    generator = torch.Generator(tensors.device).manual_seed(0)
 
     def observed(points: Callable[[], Iterator[Tensor]]) -> tuple[Tensor, Tensor]:
         tensor, seen = average(tensors, footprints, points())

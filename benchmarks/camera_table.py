@@ -61,7 +61,10 @@ def _cells(row: Row) -> list[str]:
     cells.append(f"{statistics.fmean(row['observations']):,.0f}")
     moved = [pair["mean"] for pair in row["pairs"]]
     worst = [pair["worst"] for pair in row["pairs"]]
-    cells.append(number(statistics.fmean(moved) if moved else None, 3))
+    mean = None
+    if moved:
+        mean = statistics.fmean(moved)
+    cells.append(number(mean, 3))
     cells.append(number(max(worst, default=None), 3))
     for measure in ("median", "mean"):
         cells.append(number(statistics.fmean(errors[measure] for errors in row["left_out"]), 3))

@@ -213,7 +213,9 @@ def rows_of(job: Job, work: Path) -> list[dict[str, Any]]:
     """Measure a capture in this process, and return a row for each variant."""
     date = now()
     try:
-        photos = prepare(Path(job.folder), work) if job.folder else None
+        photos = None
+        if job.folder:
+            photos = prepare(Path(job.folder), work)
         from benchmarks import camera_run  # Pillow may not write PNGs once pycolmap is imported.
 
         if photos is None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import itertools
 import json
 import os
 import subprocess
@@ -79,7 +78,9 @@ def photo_of(image: str, photos: Sequence[str]) -> str | None:
     if image in photos:
         return image
     without = image.rpartition(".")[0]
-    return without if without in photos else None
+    if without in photos:
+        return without
+    return None
 
 
 def hold_out(scene: Path, photos: Sequence[str]) -> int:
@@ -177,23 +178,19 @@ class Command(PhotoCommand):
     def chains(self) -> list[Chain]:
         """Return the chains that are asked for; raise ValueError if a capture is not there."""
         protocol = load(self.protocol)
-        names = self.only.split(",") if self.only else list(protocol.captures)
+        names = list(protocol.captures)
+        if self.only:
+            names = self.only.split(",")
         folders = {}
         for name in names:
             if name not in protocol.captures:
                 raise ValueError(f"--only names {name!r}; the protocol has {', '.join(protocol.captures)}.")
             folders[name] = self.folder_of(protocol.captures[name])
-        return [
-            Chain(
-                name,
-                folders[name],
-                seed,
-                self.label,
-                protocol.max_size,
-                protocol.effort,
-            )
-            for seed, name in itertools.product(protocol.seeds, names)
-        ]
+        chains = []
+        for seed in protocol.seeds:
+            for name in names:
+                chains.append(Chain(name, folders[name], seed, self.label, protocol.max_size, protocol.effort))
+        return chains
 
     def __call__(self) -> int:
         """Run them; return 0, 1 if one failed, or 130 after an interrupt."""
@@ -201,7 +198,9 @@ class Command(PhotoCommand):
         done = {row["key"] for row in results.read(self.output, missing_ok=True) if row["status"] == "ok"}
         log = self.output.with_suffix(".log").resolve()
         todo = [chain for chain in chains if chain.key not in done]
-        gpus = self.gpus.split(",") if self.gpus else (None,)
+        gpus: Sequence[str | None] = (None,)
+        if self.gpus:
+            gpus = self.gpus.split(",")
 
         def launch(chain: Chain, gpu: str | None, work: Path) -> subprocess.Popen[bytes]:
             return _start(chain, gpu, work, self.site, log)
@@ -213,9 +212,10 @@ class Command(PhotoCommand):
 
         if not self.run(todo, launch, ended, gpus):
             return 130
-        rows = [row for row in results.read(self.output) if row["key"] in {chain.key for chain in chains}]
-        print(markdown(results.read(self.output)))
-        return int(any(row["status"] != "ok" for row in rows))
+        rows = results.read(self.output)
+        print(markdown(rows))
+        keys = {chain.key for chain in chains}
+        return int(any(row["status"] != "ok" for row in rows if row["key"] in keys))
 
 
 def written_row(chain: Chain, code: int, work: Path) -> dict[str, Any]:
@@ -229,8 +229,10 @@ def written_row(chain: Chain, code: int, work: Path) -> dict[str, Any]:
 def _start(chain: Chain, gpu: str | None, work: Path, site: Path | None, log: Path) -> subprocess.Popen[bytes]:
     """Start a chain in a session of its own, so that the commands that it runs can be ended with it."""
     spec = json.dumps({**dataclasses.asdict(chain), "photos": str(chain.photos)})
-    words = [spec, str(work), str(site.resolve()) if site else "", str(log)]
-    command = [sys.executable, "-m", "benchmarks.chain", *words]
+    installed = ""
+    if site is not None:
+        installed = str(site.resolve())
+    command = [sys.executable, "-m", "benchmarks.chain", spec, str(work), installed, str(log)]
     return subprocess.Popen(command, env=environment_of(gpu), start_new_session=True)
 
 
@@ -239,17 +241,22 @@ def line(row: Mapping[str, Any]) -> str:
     if row["status"] != "ok":
         return f"failed: {row['error']}"
     stages = ", ".join(f"{stage} {value:.1f}" for stage, value in row["seconds"].items())
-    lpips = "" if row["lpips"] is None else f", LPIPS {row['lpips']:.4f}"
+    quality = f"PSNR {row['psnr']:.2f}, SSIM {row['ssim']:.4f}"
+    if row["lpips"] is not None:
+        quality = f"{quality}, LPIPS {row['lpips']:.4f}"
     registered = f"{row['registered']} of {row['photos']} photos"
-    return f"PSNR {row['psnr']:.2f}, SSIM {row['ssim']:.4f}{lpips}; {registered}; seconds: {stages}"
+    return f"{quality}; {registered}; seconds: {stages}"
 
 
 def main() -> None:
     """Run one chain in this process and write its row; `_start` calls it."""
-    spec, work, site, log = sys.argv[1:]
+    spec, work, installed, log = sys.argv[1:]
     fields = json.loads(spec)
     chain = Chain(**{**fields, "photos": Path(fields["photos"])})
-    row = row_of(chain, Path(work), Path(site) if site else None, Path(log))
+    site = None
+    if installed:
+        site = Path(installed)
+    row = row_of(chain, Path(work), site, Path(log))
     (Path(work) / "row.json").write_text(json.dumps(row), "utf8")
 
 

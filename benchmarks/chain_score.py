@@ -37,10 +37,11 @@ def read_photo(file: Path, max_size: int) -> Array:
     with Image.open(file) as image:
         pixels = np.asarray(ImageOps.exif_transpose(image).convert("RGB"), np.float32) / 255
     height, width = pixels.shape[:2]
-    scale = min(1.0, max_size / max(width, height)) if max_size else 1.0
-    size = (round(scale * width), round(scale * height))
-    if scale == 1:
+    longest = max(width, height)
+    if not max_size or longest <= max_size:
         return pixels
+    scale = max_size / longest
+    size = (round(scale * width), round(scale * height))
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
@@ -57,7 +58,8 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
     Returns:
         Colours in [0, 1]. [H, W, 3]
     """
-    width, height = ENLARGED * size[0], ENLARGED * size[1]
+    width = ENLARGED * size[0]
+    height = ENLARGED * size[1]
     # Rays through the centres of the enlarged image's pixels, in the photo's pixels and then without distortion.
     x = (np.arange(width) + 0.5) * camera.width / width
     y = (np.arange(height) + 0.5) * camera.height / height
@@ -65,7 +67,8 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
     rays = np.asarray(camera.cam_from_img(pixels)).reshape(height, width, -1)[..., :2]
     focal_x = camera.focal_length_x * width / camera.width
     focal_y = camera.focal_length_y * height / camera.height
-    drawn_x, drawn_y = focal_x * rays[..., 0], focal_y * rays[..., 1]
+    drawn_x = focal_x * rays[..., 0]
+    drawn_y = focal_y * rays[..., 1]
     left, right = _bounds(drawn_x, width)
     top, bottom = _bounds(drawn_y, height)
     device = splat.gaussians.means.device

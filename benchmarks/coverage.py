@@ -1,6 +1,6 @@
-"""How far held-out views are from the training views, and how much of them no training view covers.
+"""How far held-out views are from the training views.
 
-A view sees what lies before it and is projected into its image. Occlusion is not tested: the true shares are larger.
+A view sees what lies before it and is projected into its image; occlusion is not tested.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
-MAX_POINTS, SHARED_POINTS, COLUMNS, ROWS = 5000, 10, 32, 24
-"""Points that are taken, points that two views must share to have an angle, and pixels of a held-out view's grid."""
+MAX_POINTS = 5000
+"""Largest number of points that are taken."""
+SHARED_POINTS = 10
+"""Points that two views must share to have an angle."""
 
 
 class Views(NamedTuple):
@@ -30,11 +32,15 @@ class Views(NamedTuple):
         Ks = cameras.get_intrinsics_matrices().to(viewmats)  # nerfstudio makes them on the host.
         return Views(viewmats, Ks, torch.cat([cameras.width, cameras.height], dim=-1))
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # points: [P, 3]
-        """Return pixels [C, P, 2] and depths [C, P] of points [P, 3], and which view sees which point [C, P]."""
-        in_camera = points @ self.viewmats[:, :3, :3].mT + self.viewmats[:, None, :3, 3]  # [C, P, 3]
-        depths, pixels = in_camera[..., 2], (in_camera @ self.Ks.mT)[..., :2] / in_camera[..., 2:]
-        return pixels, depths, (depths > 0) & ((pixels >= 0) & (pixels <= self.sizes[:, None])).all(dim=-1)
+    def see(self, points: Tensor) -> Tensor:  # points: [P, 3]
+        """Return which view sees which of the points [P, 3]. bool [C, P]"""
+        rotations = self.viewmats[:, :3, :3]
+        shifts = self.viewmats[:, None, :3, 3]
+        in_camera = points @ rotations.mT + shifts  # [C, P, 3]
+        depths = in_camera[..., 2]
+        pixels = (in_camera @ self.Ks.mT)[..., :2] / in_camera[..., 2:]
+        in_image = (pixels >= 0) & (pixels <= self.sizes[:, None])  # [C, P, 2]
+        return (depths > 0) & in_image.all(dim=-1)
 
     def directions(self, points: Tensor) -> Tensor:  # points: [P, 3]
         """Return unit vectors from points [P, 3] to the cameras. [C, P, 3]"""
@@ -58,34 +64,18 @@ def nearest_angles(held_out: Views, training: Views, points: Tensor) -> Tensor: 
     Returns:
         Smallest angles in degrees, in [0, 180]; NaN where a held-out view has none. [E]
     """
-    points, angles = thinned(points), points.new_full((len(held_out.sizes),), torch.nan)
-    to_held_out, to_training = held_out.directions(points), training.directions(points)  # [E, Q, 3], [T, Q, 3]
-    seen_in_training = training.project(points)[2]  # [T, Q]
-    for i, seen in enumerate(held_out.project(points)[2]):
-        near = (shared := seen_in_training & seen).sum(dim=-1) >= SHARED_POINTS  # [T]
+    angles = points.new_full((len(held_out.sizes),), torch.nan)
+    points = thinned(points)
+    to_held_out = held_out.directions(points)  # [E, Q, 3]
+    to_training = training.directions(points)  # [T, Q, 3]
+    seen_in_training = training.see(points)  # [T, Q]
+    for i, seen in enumerate(held_out.see(points)):
+        shared = seen_in_training & seen  # [T, Q]
+        near = shared.sum(dim=-1) >= SHARED_POINTS  # [T]
         if near.any():
             # The arc sine of half the chord is exact near 0, where the arc cosine of a float32 is not.
-            between = 2 * ((to_training[near] - to_held_out[i]).norm(dim=-1) / 2).clamp(max=1).asin().rad2deg()
-            angles[i] = between.masked_fill(~shared[near], torch.nan).nanmedian(dim=-1).values.min()
+            half_chords = (to_training[near] - to_held_out[i]).norm(dim=-1) / 2
+            between = 2 * half_chords.clamp(max=1).asin().rad2deg()
+            medians = between.masked_fill(~shared[near], torch.nan).nanmedian(dim=-1).values
+            angles[i] = medians.min()
     return angles
-
-
-def uncovered_shares(held_out: Views, training: Views, points: Tensor) -> Tensor:  # points: [P, 3]
-    """Return which share of the pixels of each of E held-out views lies in the frustum of no training view.
-
-    Each pixel takes the depth of the point, of those of the points [P, 3] that the view sees, whose projection is
-    nearest. The pixel is covered if some training view sees the place at this depth.
-
-    Returns:
-        Shares in [0, 1]; NaN where the held-out view sees no point. [E]
-    """
-    points, shares = thinned(points), points.new_full((len(held_out.sizes),), torch.nan)
-    grid = torch.cartesian_prod(*((torch.arange(n, device=points.device) + 0.5) / n for n in (COLUMNS, ROWS)))
-    for i, (pixels, depths, seen) in enumerate(zip(*held_out.project(points), strict=True)):
-        if seen.any():
-            at, viewmat = grid * held_out.sizes[i], held_out.viewmats[i]  # [G, 2] px
-            nearest = torch.cdist(at, pixels[seen]).argmin(dim=-1)
-            rays = torch.nn.functional.pad(at, (0, 1), value=1.0) @ held_out.Ks[i].inverse().mT  # [G, 3], of depth 1
-            places = (rays * depths[seen][nearest, None] - viewmat[:3, 3]) @ viewmat[:3, :3]
-            shares[i] = 1 - training.project(places)[2].any(dim=0).float().mean()
-    return shares

@@ -33,7 +33,8 @@ class LoopTimer:
     def attach(self, trainer: Any) -> None:
         """Register with a nerfstudio Trainer that is set up."""
         last = trainer.config.max_num_iterations - 1
-        before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+        after = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
         trainer.callbacks.insert(0, TrainingCallback([before], lambda step: self._go(), iters=(0,)))
         trainer.callbacks.append(TrainingCallback([after], self._end, iters=(last,)))
 
@@ -66,8 +67,10 @@ def undisturbed(pipeline: Any) -> Iterator[None]:
     That is the training mode, the random states of Python, numpy and torch, and what rendering notes on the model:
     splatfacto's strategy still reads the `info` of the step's own rendering.
     """
-    training, noted = pipeline.training, dict(vars(pipeline.model))
-    python, numpy = random.getstate(), np.random.get_state()
+    training = pipeline.training
+    noted = dict(vars(pipeline.model))
+    python = random.getstate()
+    numpy = np.random.get_state()
     devices = [torch.cuda.current_device()] if torch.cuda.is_available() else []
     pipeline.eval()
     try:
@@ -92,7 +95,8 @@ class Curve:
         self.points: list[dict[str, Any]] = []
         """By iterations: `step` (iterations done), `seconds` of the loop so far, `psnr`, `ssim`, `lpips` and
         `gaussians`. The run's last iteration is not among them: the evaluation after the run measures it."""
-        self._every, self._timer = every, timer
+        self._every = every
+        self._timer = timer
         self._network: Any = None
 
     def attach(self, trainer: Any) -> None:

@@ -22,9 +22,11 @@ def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
 
     from benchmarks.run import build_config
 
-    missing, checked = {}, set()
+    missing = {}
+    checked = set()
     for job in {(job.scene.name, job.row.label): job for job in jobs}.values():
-        name, folder = job.scene.name, root / job.scene.data
+        name = job.scene.name
+        folder = root / job.scene.data
         if not folder.exists():
             missing[name] = f"{folder} does not exist"
             continue
@@ -45,8 +47,11 @@ def check(jobs: Sequence[Job], root: Path, source: str | None = None) -> None:
                 file=sys.stderr,
             )
     if missing:
-        what = ", ".join(f"scene {name!r}: {text}" for name, text in missing.items())
-        raise ValueError(f"{what}; check --scenes{f' or get {source}' if source else ''}.")
+        faults = ", ".join(f"scene {name!r}: {text}" for name, text in missing.items())
+        remedy = "check --scenes"
+        if source:
+            remedy = f"{remedy} or get {source}"
+        raise ValueError(f"{faults}; {remedy}.")
 
 
 def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
@@ -58,16 +63,19 @@ def image_names(parser: ColmapDataParserConfig, data: Path) -> list[str]:
 
     from sadgs_ns.data.images import MAX_AUTO_RESOLUTION, image_size, smaller_folder
 
-    model, images = data / parser.colmap_path, data / parser.images_path
+    model = data / parser.colmap_path
+    images = data / parser.images_path
     if (model / "cameras.txt").exists():  # nerfstudio's order of preference
         views = colmap.read_images_text(model / "images.txt")
     elif (model / "cameras.bin").exists():
         views = colmap.read_images_binary(model / "images.bin")
     else:
         raise FileNotFoundError(f"{model} holds no COLMAP model")
-    names, factor = [views[index].name for index in sorted(views)], parser.downscale_factor
+    names = [views[index].name for index in sorted(views)]
+    factor = parser.downscale_factor
     if factor is None:
-        longest, factor = max(image_size(images / names[0])), 1
+        longest = max(image_size(images / names[0]))
+        factor = 1
         while longest / factor > MAX_AUTO_RESOLUTION:
             factor *= 2
     folder = smaller_folder(images, factor)

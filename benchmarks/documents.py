@@ -28,8 +28,12 @@ from benchmarks import camera_table, chain_table, table
 from benchmarks.table import Change, Run
 from sadgs_ns.files import atomic_path
 
-RESULTS, FIGURES, TABLES = Path("docs", "results"), Path("docs", "figures"), "tables.yaml"
-"""Folders of the rows and of the figures in a checkout, and the name of the description among the rows."""
+RESULTS = Path("docs", "results")
+"""Folder of the rows in a checkout."""
+FIGURES = Path("docs", "figures")
+"""Folder of the figures in a checkout."""
+TABLES = "tables.yaml"
+"""Name of the description among the rows."""
 Scenes = Sequence[str] | Mapping[str, Sequence[str]]
 """Scenes, or names with the scenes that each is the mean of, as those of a capture that hold out other views."""
 _MARKED = re.compile(r"^<!-- table: (\S+) -->\n(.*?)^<!-- end -->$", re.MULTILINE | re.DOTALL)
@@ -50,7 +54,8 @@ class Source:
         """The rows of files in the folder."""
         self.cited |= {*names}
         rows: list[dict[str, Any]] = []
-        for path in (self.folder / name for name in names):
+        for name in names:
+            path = self.folder / name
             if not path.is_file():
                 raise ValueError(f"{path} is not there; rows lie in docs/results.")
             rows += map(json.loads, path.read_text("utf-8").splitlines())
@@ -58,9 +63,12 @@ class Source:
 
     def lines(self, rows: str, scenes: Scenes, labels: Mapping[str, str], reference: str | None = None) -> list[Run]:
         """Of each scene, or capture with folds, a run for each label; the others are compared with `reference`."""
-        found, runs = table.groups(self.read(rows)), []
+        found = table.groups(self.read(rows))
+        runs = []
         for scene, folds in folds_of(scenes).items():
-            base = [] if reference is None else [table.group_of(found, fold, reference) for fold in folds]
+            base = []
+            if reference is not None:
+                base = [table.group_of(found, fold, reference) for fold in folds]
             for label, name in labels.items():
                 cell = [table.group_of(found, fold, label) for fold in folds]
                 runs.append(Run(scene, name, cell, base, self.megapixels.get(scene)))
@@ -68,7 +76,8 @@ class Source:
 
     def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]]) -> str:
         """A run a line."""
-        return table.of_runs((run for line in lines for run in self.lines(**line)), columns)
+        runs = [run for line in lines for run in self.lines(**line)]
+        return table.of_runs(runs, columns)
 
     def change(
         self,
@@ -80,24 +89,32 @@ class Source:
     ) -> Change:
         """What changing from one label to another does to scenes, or to captures with folds."""
         found = table.groups(self.read(*rows))
-        old, new = (
-            [[table.group_of(found, fold, label) for fold in folds] for folds in folds_of(scenes).values()]
-            for label in change
-        )
+        before, after = change
+        old = []
+        new = []
+        for folds in folds_of(scenes).values():
+            old.append([table.group_of(found, fold, before) for fold in folds])
+            new.append([table.group_of(found, fold, after) for fold in folds])
         return Change(texts, old, new, remark)
 
     def changes(self, header: Sequence[str], remark: str, lines: Sequence[Mapping[str, Any]]) -> str:
         """A change a line."""
-        return table.of_changes((self.change(**line) for line in lines), header, remark)
+        changes = [self.change(**line) for line in lines]
+        return table.of_changes(changes, header, remark)
 
     def sweep(self, rows: Sequence[str], labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
         """A setting a line."""
-        return table.of_sweep(table.groups(self.read(*rows)), labels, scenes)
+        found = table.groups(self.read(*rows))
+        return table.of_sweep(found, labels, scenes)
 
     def approximations(self, rows: str, of: str, input: str, variants: Sequence[str] | None = None) -> str:
         """What `approximations` measured in an image, of some variants or of all."""
-        found = {r["variant"]: r for r in self.read(rows) if (r["table"], r["input"]) == (of, input)}
-        return table.of_approximations([found[name] for name in variants or found])
+        found = {}
+        for row in self.read(rows):
+            if (row["table"], row["input"]) == (of, input):
+                found[row["variant"]] = row
+        shown = variants or found
+        return table.of_approximations([found[name] for name in shown])
 
     def chain(self, rows: str, labels: Mapping[str, str]) -> str:
         """What `benchmarks.chain` measured, a line for each capture and label."""
@@ -115,18 +132,27 @@ class Source:
         """Arguments of `plots.peers`."""
         runs = [(run, True) for line in lines for run in self.lines(**line)]
         runs += [(run, False) for line in elsewhere for run in self.lines(**line)]
-        return [[(run.name, here, *map(run.mean, ("loop_seconds", "psnr", "lpips"))) for run, here in runs]]
+        points = []
+        for run, here in runs:
+            means = [run.mean(name) for name in ("loop_seconds", "psnr", "lpips")]
+            points.append((run.name, here, *means))
+        return [points]
 
     def quality_drawn(self, rows: str, scenes: Sequence[str], labels: Mapping[str, str]) -> list[Any]:
         """Arguments of `plots.quality`."""
         found = table.groups(self.read(rows))
-        named = [(scene, label, name) for scene in scenes for label, name in labels.items()]
-        return [[((scene, name), table.group_of(found, scene, label)) for scene, label, name in named]]
+        named = []
+        for scene in scenes:
+            for label, name in labels.items():
+                named.append(((scene, name), table.group_of(found, scene, label)))
+        return [named]
 
 
 def folds_of(scenes: Scenes) -> Mapping[str, Sequence[str]]:
     """Names with the scenes that each is the mean of."""
-    return scenes if isinstance(scenes, Mapping) else {scene: [scene] for scene in scenes}
+    if isinstance(scenes, Mapping):
+        return scenes
+    return {scene: [scene] for scene in scenes}
 
 
 def made(source: Source, what: str, name: str, description: Any) -> Any:
@@ -136,8 +162,10 @@ def made(source: Source, what: str, name: str, description: Any) -> Any:
     """
     try:
         options = dict(description)
-        kind = options.pop("kind")
-        return getattr(source, kind if what == "table" else f"{kind}_drawn")(**options)
+        method = options.pop("kind")
+        if what == "figure":
+            method = f"{method}_drawn"
+        return getattr(source, method)(**options)
     except ValueError as error:
         raise ValueError(f"{what} {name}: {error}") from error
     except (AttributeError, KeyError, TypeError) as error:
@@ -166,40 +194,71 @@ def write(checkout: Path, check: bool = False) -> list[str]:
             nothing is written then.
         WriteError: A document cannot be written.
     """
-    from benchmarks import plots
-
     folder = checkout / RESULTS
     source, tables, figures = described(folder)
     new = {name: f"\n{made(source, 'table', name, description)}\n\n" for name, description in tables.items()}
     drawn = {name: made(source, "figure", name, description) for name, description in figures.items()}
-    if spare := {path.name for path in folder.iterdir()} - source.cited:
+    spare = {path.name for path in folder.iterdir()} - source.cited
+    if spare:
         raise ValueError(f"{folder}: no table is made of {', '.join(sorted(spare))}; delete what none needs.")
-    texts, changed, used = {}, [], set()
-    for path in (path for path in (checkout / "README.md", *sorted((checkout / "docs").glob("*.md"))) if path.exists()):
+    texts = {}
+    changed = []
+    used = set()
+    for path in _documents(checkout):
         text = path.read_text("utf-8")
-        if len(_OPENED.findall(text)) != 2 * len(_MARKED.findall(text)):
-            raise ValueError(f"{path}: each `<!-- table: NAME -->` needs one `<!-- end -->` after it.")
-        for name, old in _MARKED.findall(text):
-            if name not in tables:
+        for name, old in _marked(path, text):
+            if name not in new:
                 raise ValueError(f"{path}: table {name} is not in {folder / TABLES}.")
             used.add(name)
-            changed += [f"{path}: table {name}"] if new[name] != old else []
+            if new[name] != old:
+                changed.append(f"{path}: table {name}")
         texts[path] = _MARKED.sub(lambda match: f"<!-- table: {match[1]} -->\n{new[match[1]]}<!-- end -->", text)
-    if spare := tables.keys() - used:
-        raise ValueError(f"{folder / TABLES}: no document holds {', '.join(sorted(spare))}; delete what none needs.")
-    for path, text in {} if check else texts.items():
+    unused = tables.keys() - used
+    if unused:
+        raise ValueError(f"{folder / TABLES}: no document holds {', '.join(sorted(unused))}; delete what none needs.")
+    if not check:
+        _write_texts(texts)
+    for name, arguments in drawn.items():
+        path = checkout / FIGURES / f"{name}.png"
+        if _draw(path, figures[name]["kind"], arguments, check):
+            changed.append(str(path))
+    return changed
+
+
+def _documents(checkout: Path) -> list[Path]:
+    """The documents of a checkout that are there."""
+    paths = [checkout / "README.md", *sorted((checkout / "docs").glob("*.md"))]
+    return [path for path in paths if path.exists()]
+
+
+def _marked(path: Path, text: str) -> list[tuple[str, str]]:
+    """Names and texts of the tables that stand in a document; raises ValueError if one has no end."""
+    marked = _MARKED.findall(text)
+    if len(_OPENED.findall(text)) != 2 * len(marked):
+        raise ValueError(f"{path}: each `<!-- table: NAME -->` needs one `<!-- end -->` after it.")
+    return marked
+
+
+def _write_texts(texts: Mapping[Path, str]) -> None:
+    """Write the documents whose text is another one; raises WriteError."""
+    for path, text in texts.items():
         if text != path.read_text("utf-8"):
             with atomic_path(path) as partial:
                 partial.write_text(text, "utf-8")
-    for name, arguments in drawn.items():
-        path = checkout / FIGURES / f"{name}.png"
-        digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
-        if plots.digest_in(path) != digest:
-            changed.append(str(path))
-            if not check:
-                with atomic_path(path) as partial:
-                    plots.save(getattr(plots, figures[name]["kind"])(*arguments), partial, digest)
-    return changed
+
+
+def _draw(path: Path, kind: str, arguments: Sequence[Any], check: bool) -> bool:
+    """Draw a figure, or only `check` it, and return whether the file was not drawn from these arguments."""
+    from benchmarks import plots
+
+    digest = hashlib.sha256(json.dumps(arguments).encode()).hexdigest()
+    if plots.digest_in(path) == digest:
+        return False
+    if not check:
+        figure = getattr(plots, kind)(*arguments)
+        with atomic_path(path) as partial:
+            plots.save(figure, partial, digest)
+    return True
 
 
 @dataclass
@@ -214,7 +273,9 @@ class Command:
 
     def __call__(self) -> int:
         changed = write(self.checkout, self.check)
-        remedy = "is not what its rows give; run python -m benchmarks documents." if self.check else "is written."
+        remedy = "is written."
+        if self.check:
+            remedy = "is not what its rows give; run python -m benchmarks documents."
         for name in changed:
             print(f"{name} {remedy}")
         return int(self.check and bool(changed))

@@ -90,8 +90,10 @@ def quality(
     measures: dict[str, Any] = {
         "psnr": partial(peak_signal_noise_ratio, data_range=1.0),
         "ssim": partial(structural_similarity_index_measure, data_range=1.0, sigma=1.5, kernel_size=11),
-        "lpips": None if network is None else network.to(model.device),
+        "lpips": None,
     }
+    if network is not None:
+        measures["lpips"] = network.to(model.device)
     values: dict[str, list[float]] = {name: [] for name in measures}
     # nerfstudio has cuDNN search for algorithms, with whatever memory is free as their workspace. Probably so a process
     # came to hold 133 GiB, for want of which another one on the same GPU failed here.
@@ -106,8 +108,13 @@ def quality(
                         of_views.append(float(measure(image, truth)))
     if network is not None:
         network.cpu()
-    means = {name: statistics.fmean(of_views) if of_views else None for name, of_views in values.items()}
-    return means | {"view_psnr": [round(psnr, 2) for psnr in values["psnr"]]}
+    measured: dict[str, Any] = {}
+    for name, of_views in values.items():
+        measured[name] = None
+        if of_views:
+            measured[name] = statistics.fmean(of_views)
+    measured["view_psnr"] = [round(psnr, 2) for psnr in values["psnr"]]
+    return measured
 
 
 def view_psnr_in_viewers(model: Any, views: Iterable[View], view_psnr: list[float]) -> list[float]:

@@ -37,7 +37,10 @@ Array = NDArray[np.float64]
 def draw_gains(views: int, spread: float, white_balance: float, mean: float, seed: int) -> tuple[Array, Array]:
     """Draw gains of photos, at least one, [V] and their channels' factors [V, 3], as at the top of this module."""
     generator = np.random.default_rng(seed)
-    gains = mean * spread ** (generator.permutation(views) / max(views - 1, 1) - 0.5 * (views > 1))
+    exponents = np.zeros(views)
+    if views > 1:
+        exponents = generator.permutation(views) / (views - 1) - 0.5
+    gains = mean * spread**exponents
     factors = generator.uniform(-1, 1, (views, 3))
     factors -= factors.mean(axis=1, keepdims=True)
     # Less their mean, factors can be up to 4/3 as large.
@@ -71,12 +74,18 @@ def write_scene(scene: Path, out: Path, spread: float, white_balance: float, mea
     (out / "sparse").symlink_to((scene / "sparse").resolve())
     written: dict[str, dict[str, Any]] = {}
     for name, holds_out in zip(names, held_out, strict=True):
-        gain, of_channels = (mean, np.ones(3)) if holds_out else next(drawn)
+        gain = mean
+        of_channels = np.ones(3)
+        if not holds_out:
+            gain, of_channels = next(drawn)
         with Image.open(scene / "images" / name) as image:
             changed = Image.fromarray(with_gains(np.asarray(image.convert("RGB")), gain * of_channels))
         path = out / "images" / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        changed.save(path, **(JPEG if path.suffix.lower() in (".jpg", ".jpeg") else {}))
+        options = {}
+        if path.suffix.lower() in (".jpg", ".jpeg"):
+            options = JPEG
+        changed.save(path, **options)
         written[name] = {"gain": float(gain), "channels": of_channels.tolist(), "held_out": holds_out}
     (out / FILE).write_text(json.dumps(written, indent=1) + "\n")
 
@@ -97,8 +106,9 @@ class Command:
     """geometric mean of the gains (default: the largest at which nothing saturates)"""
 
     def __call__(self) -> int:
-        largest = (1 + self.white_balance) ** -1 * max(self.spread, 1e-9) ** -0.5
-        mean = largest if self.mean is None else self.mean
+        mean = self.mean
+        if mean is None:
+            mean = (1 + self.white_balance) ** -1 * max(self.spread, 1e-9) ** -0.5
         if not (self.scene / SPARSE).is_dir():
             raise ValueError(f"{self.scene} holds no {SPARSE}; give the folder of a COLMAP scene.")
         if self.out.exists() and not (self.out / FILE).exists():

@@ -35,13 +35,15 @@ class Metric:
         if self.direction not in DIRECTIONS:
             raise ValueError(f"direction must be one of {', '.join(DIRECTIONS)}")
         numbers = (self.value, self.tolerance)
-        if not all(type(n) in (int, float) and math.isfinite(n) for n in numbers) or self.tolerance < 0:
+        are_finite = all(type(number) in (int, float) and math.isfinite(number) for number in numbers)
+        if not are_finite or self.tolerance < 0:
             raise ValueError("value must be a number, and tolerance one from 0")
 
     def fails(self, value: float) -> bool:
         """Whether a value is worse than the tolerance allows; one that is no number always is."""
         moved = value - self.value
-        return not {"higher": -moved, "lower": moved, "near": abs(moved)}[self.direction] <= self.tolerance
+        worse = {"higher": -moved, "lower": moved, "near": abs(moved)}[self.direction]
+        return not worse <= self.tolerance
 
 
 Baseline = dict[str, dict[str, Metric]]
@@ -52,7 +54,10 @@ def read(path: Path) -> Baseline:
     """Read a baseline; raises ValueError if the file is none."""
     try:
         content = json.loads(path.read_text())
-        return {row: {name: Metric(**entry) for name, entry in metrics.items()} for row, metrics in content.items()}
+        baseline: Baseline = {}
+        for row, metrics in content.items():
+            baseline[row] = {name: Metric(**entry) for name, entry in metrics.items()}
+        return baseline
     except (OSError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} is no baseline ({error}); it must hold rows, their metrics, and of each value, direction and "
@@ -70,21 +75,33 @@ def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Resul
     for row, metrics in baseline.items():
         group = runs.get(row, [])
         measured = [result for result in group if result is not None]
-        if not group or len(measured) < len(group):
-            done = f"{len(measured)} of {len(group)} runs ended well" if group else "no such run was asked for"
+        if not group:
+            lines.append(f"{row} is missing from the results: no such run was asked for.")
+            continue
+        if len(measured) < len(group):
+            done = f"{len(measured)} of {len(group)} runs ended well"
             lines.append(f"{row} is missing from the results: {done}.")
             continue
         for name, metric in metrics.items():
             values = table.values(measured, name)
             if len(values) < len(measured):
                 lines.append(f"{row}: {name} was not measured; the baseline has {metric.value:.6g}.")
-            elif metric.fails(mean := sum(values) / len(values)):
-                better = "either way" if metric.direction == "near" else f"{metric.direction} is better"
-                lines.append(
-                    f"{row}: {name} moved by {mean - metric.value:+.4g}, from {metric.value:.6g} to {mean:.6g}; "
-                    f"tolerance {metric.tolerance:.4g} ({better})."
-                )
+                continue
+            mean = sum(values) / len(values)
+            if metric.fails(mean):
+                lines.append(f"{row}: {name} {_movement(metric, mean)}")
     return lines
+
+
+def _movement(metric: Metric, value: float) -> str:
+    """How far a value has moved from the baseline's, and how far it may."""
+    better = f"{metric.direction} is better"
+    if metric.direction == "near":
+        better = "either way"
+    return (
+        f"moved by {value - metric.value:+.4g}, from {metric.value:.6g} to {value:.6g}; "
+        f"tolerance {metric.tolerance:.4g} ({better})."
+    )
 
 
 def judge(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> bool:
@@ -93,6 +110,9 @@ def judge(path: Path, jobs: Sequence[Job], results: Sequence[Result]) -> bool:
     lines = regressions(baseline, jobs, results)
     for line in lines:
         print(f"Gate: {line}")
+    verdict = "passed"
+    if lines:
+        verdict = "FAILED"
     count = sum(len(metrics) for metrics in baseline.values())
-    print(f"Gate: {'FAILED' if lines else 'passed'}, {count} metrics of {len(baseline)} rows in {path}.")
+    print(f"Gate: {verdict}, {count} metrics of {len(baseline)} rows in {path}.")
     return not lines

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,14 @@ METRICS = {"psnr": ("PSNR [dB]", True), "ssim": ("SSIM", True), "lpips": ("LPIPS
 
 _OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#000000", "#CC79A7", "#56B4E9", "#E69F00")  # yellow is too light
 _MARKERS = "os^DvPX*<>ph"
+_FILLS: dict[bool, Any] = {True: "full", False: "none"}
+"""How markers are filled, by whether the run was on the machine that most share."""
+_SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
+"""Where a name may stand beside its point, the best place first: 1 is to the right, or above."""
 _SHOWN_BELOW = {"psnr": 5.0, "ssim": 0.15, "lpips": 0.2}
 """How much worse than the worst final value a curve's beginning may be and still be shown."""
-_GREY, _WIDTH = "#767676", 7.2
+_GREY = "#767676"
+_WIDTH = 7.2
 _LEAST_RATIO = 5.0
 """Between the ends of a logarithmic axis; the ticks below then are at least three."""
 _TICKS = {12: (1, 2, 3, 5), 50: (1, 2, 5), 500: (1, 3)}
@@ -68,24 +73,37 @@ def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]]) -> Figu
     figure = Figure(figsize=(_WIDTH, 1.9 * len(scenes) + 0.6))
     grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
     for (scene, metric), axes in zip(itertools.product(scenes, METRICS), grid.flat, strict=True):
-        here = [(label, group) for (where, label), group in groups.items() if where == scene]
-        ends = {label: _known([(mean(group, "loop_seconds"), mean(group, metric))]) for label, group in here}
-        for label, group in here:
-            seeds = _known([(row.get("loop_seconds"), row.get(metric)) for row in group])
-            if len(group) > 1:
-                _plot(axes, seeds, **looks[label], alpha=0.4, markersize=3.5, linestyle="")
-            _plot(axes, ends[label], **looks[label], linestyle="", zorder=3)
-            curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
-            _plot(axes, curve, **looks[label], markersize=3.5)
+        here = {label: group for (where, label), group in groups.items() if where == scene}
+        _plot_runs(axes, here, metric, looks)
         _finish(axes, metric)
         if metric == "psnr":
             axes.set_title(scene)
     rows = [row for group in groups.values() for row in group]
-    line = "-" if any(row.get("curve") for row in rows) else ""
+    line = ""
+    if any(row.get("curve") for row in rows):
+        line = "-"
     handles = [Line2D([], [], **look, linestyle=line, label=label) for label, look in looks.items()]
-    shared = any(row.get("jobs_per_gpu", 1) > 1 for row in rows if row.get("loop_seconds") is not None)
-    _finish_figure(figure, "runs shared a GPU: times are not comparable" if shared else "← less is better", handles)
+    remark = "← less is better"
+    timed = [row for row in rows if row.get("loop_seconds") is not None]
+    if any(row.get("jobs_per_gpu", 1) > 1 for row in timed):
+        remark = "runs shared a GPU: times are not comparable"
+    _finish_figure(figure, remark, handles)
     return figure
+
+
+def _plot_runs(axes: Axes, groups: Mapping[str, Sequence[Result]], metric: str, looks: Mapping[str, Any]) -> None:
+    """Plot a metric of one scene's runs by their labels: each seed, the mean, and the curve up to it."""
+    ends = {}
+    for label, group in groups.items():
+        ends[label] = _known([(mean(group, "loop_seconds"), mean(group, metric))])
+    for label, group in groups.items():
+        seeds = _known([(row.get("loop_seconds"), row.get(metric)) for row in group])
+        look = looks[label]
+        if len(group) > 1:
+            _plot(axes, seeds, **look, alpha=0.4, markersize=3.5, linestyle="")
+        _plot(axes, ends[label], **look, linestyle="", zorder=3)
+        curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
+        _plot(axes, curve, **look, markersize=3.5)
 
 
 @_styled
@@ -101,8 +119,7 @@ def peers(points: Sequence[tuple[str, bool, float, float, float]]) -> Figure:
     panels = list(zip(figure.subplots(1, 2), ("psnr", "lpips"), (3, 4), strict=True))
     for axes, metric, column in panels:
         for method, point in zip(methods, points, strict=True):
-            fill = "full" if point[1] else "none"
-            axes.plot(point[2], point[column], **looks[method], linestyle="", fillstyle=fill)
+            axes.plot(point[2], point[column], **looks[method], linestyle="", fillstyle=_FILLS[point[1]])
         _finish(axes, metric)
     grey: dict[str, Any] = {"color": _GREY, "marker": "o", "linestyle": ""}
     handles = [Line2D([], [], **grey, label="on one machine")]
@@ -121,14 +138,17 @@ def _name_points(axes: Axes, named: Sequence[tuple[str, float, float]]) -> None:
     taken = [Bbox.from_bounds(x - 6, y - 6, 12, 12) for x, y in centres]
     for name, x, y in named:
         places: list[tuple[float, int, Annotation, Bbox]] = []
-        for number, (right, up) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))):
+        for number, (right, up) in enumerate(_SIDES):
             aligned: Any = {"ha": ("center", "left", "right")[right], "va": ("center", "bottom", "top")[up]}
-            # Diagonally as far as the point's edge; in 1/72 in.
-            offset = (right * (6 if not up else 4), up * (6 if not right else 4))
+            distance = 6  # In 1/72 in
+            if right and up:  # Diagonally as far as the point's edge
+                distance = 4
+            offset = (right * distance, up * distance)
             text = axes.annotate(name, (x, y), offset, textcoords="offset points", in_layout=False, **aligned)
             box = text.get_window_extent()
             covered = sum(_area(Bbox.intersection(box, other)) for other in taken)
-            places.append((covered + _area(box) - _area(Bbox.intersection(box, axes.bbox)), number, text, box))
+            outside = _area(box) - _area(Bbox.intersection(box, axes.bbox))
+            places.append((covered + outside, number, text, box))
         places.sort(key=lambda place: place[:2])
         taken.append(places[0][3])
         for _, _, text, _ in places[1:]:
@@ -136,7 +156,9 @@ def _name_points(axes: Axes, named: Sequence[tuple[str, float, float]]) -> None:
 
 
 def _area(box: Bbox | None) -> float:
-    return 0.0 if box is None else box.width * box.height
+    if box is None:
+        return 0.0
+    return box.width * box.height
 
 
 @_styled
@@ -166,24 +188,39 @@ def _plot(axes: Axes, points: Points, **looks: Any) -> None:
 
 def _curve(group: Sequence[Result], metric: str) -> Points:
     """Mean (seconds, metric) at the steps that all of a group's curves have, the last of which is the run's end."""
-    curves = [{point["step"]: point for point in row["curve"]} for row in group if row.get("curve")]
-    points = (
-        [[curve[step] for curve in curves] for step in sorted(set.intersection(*map(set, curves)))] if curves else []
-    )
-    return _known((mean(point, "seconds"), mean(point, metric)) for point in points)
+    curves = []
+    for row in group:
+        if row.get("curve"):
+            curves.append({point["step"]: point for point in row["curve"]})
+    if not curves:
+        return []
+    means = []
+    for step in sorted(set.intersection(*map(set, curves))):
+        points = [curve[step] for curve in curves]
+        means.append((mean(points, "seconds"), mean(points, metric)))
+    return _known(means)
 
 
 def _without_beginning(curve: Points, ends: Iterable[tuple[float, float]], metric: str) -> Points:
     """A curve without its far worse beginning, so that the ends can be told apart."""
-    sign = 1 if METRICS[metric][1] else -1
-    worst = min((sign * value for _, value in ends), default=-math.inf)
-    return [(x, value) for x, value in curve if sign * value >= worst - _SHOWN_BELOW[metric]]
+    finals = [value for _, value in ends]
+    if not finals:
+        return curve
+    _, higher = METRICS[metric]
+    if higher:
+        least = min(finals) - _SHOWN_BELOW[metric]
+        return [(x, value) for x, value in curve if value >= least]
+    most = max(finals) + _SHOWN_BELOW[metric]
+    return [(x, value) for x, value in curve if value <= most]
 
 
 def _finish(axes: Axes, metric: str) -> None:
     """Titles, and a logarithmic x axis with two ticks or more."""
     title, higher = METRICS[metric]
-    axes.set_ylabel(f"{title}   ({'↑' if higher else '↓'} better)")
+    arrow = "↓"
+    if higher:
+        arrow = "↑"
+    axes.set_ylabel(f"{title}   ({arrow} better)")
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], min_n_ticks=3))
     if not axes.lines:
         axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=_GREY)

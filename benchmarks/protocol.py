@@ -95,12 +95,17 @@ class Protocol:
 
     def jobs(self) -> list[Job]:
         """All runs: rows in their order, then scenes, then seeds."""
-        return [
-            Job(self.scenes[name], row, seed)
-            for row in self.rows
-            for name in (self.scenes if row.scenes is None else row.scenes)
-            for seed in (self.seeds if row.seeds is None else row.seeds)
-        ]
+        jobs = []
+        for row in self.rows:
+            names = row.scenes
+            if names is None:
+                names = tuple(self.scenes)
+            seeds = row.seeds
+            if seeds is None:
+                seeds = self.seeds
+            for name in names:
+                jobs += [Job(self.scenes[name], row, seed) for seed in seeds]
+        return jobs
 
 
 def load(path: Path) -> Protocol:
@@ -122,16 +127,19 @@ def parse(content: object) -> Protocol:
     if not scenes:
         raise ValueError("scenes is empty; name at least one scene.")
     common = {"curve_every": top.get("curve_every")}
-    rows = tuple(
-        _row({**common, **_mapping(value, f"rows[{i}]")}, f"rows[{i}]", scenes)
-        for i, value in enumerate(_list(top["rows"], "rows"))
-    )
+    rows = []
+    for i, value in enumerate(_list(top["rows"], "rows")):
+        where = f"rows[{i}]"
+        rows.append(_row({**common, **_mapping(value, where)}, where, scenes))
     pairs = Counter((row.label, scene) for row in rows for scene in row.scenes or scenes)
     for (label, scene), count in pairs.items():
         if count > 1:
             raise ValueError(f"two rows have the label {label!r} for {scene}; give each its own.")
-    source = None if top.get("source") is None else _text(top, "source", "the protocol")
-    return Protocol(scenes, rows, _seeds(top.get("seeds", [0, 1]), "seeds"), source)
+    source = None
+    if top.get("source") is not None:
+        source = _text(top, "source", "the protocol")
+    seeds = _seeds(top.get("seeds", [0, 1]), "seeds")
+    return Protocol(scenes, tuple(rows), seeds, source)
 
 
 def set_dotted(config: Any, path: str, value: Any) -> None:
@@ -155,12 +163,17 @@ def _child(node: Any, name: str, path: str, parent: str) -> Any:
     where = parent or "the config"
     if not isinstance(node, dict) and not dataclasses.is_dataclass(node):
         raise ValueError(f"override {path!r}: {where} is {node!r}, which has no settings; shorten the path.")
-    names = [str(key) for key in node] if isinstance(node, dict) else [f.name for f in dataclasses.fields(node)]
-    if name not in names:
-        similar = difflib.get_close_matches(name, names, n=1)
-        remedy = f"did you mean {similar[0]!r}?" if similar else f"it has {', '.join(sorted(names))}."
+    if isinstance(node, dict):
+        children = {str(key): value for key, value in node.items()}
+    else:
+        children = {field.name: getattr(node, field.name) for field in dataclasses.fields(node)}
+    if name not in children:
+        remedy = f"it has {', '.join(sorted(children))}."
+        similar = difflib.get_close_matches(name, children, n=1)
+        if similar:
+            remedy = f"did you mean {similar[0]!r}?"
         raise ValueError(f"override {path!r}: {where} has no {name!r}; {remedy}")
-    return node[name] if isinstance(node, dict) else getattr(node, name)
+    return children[name]
 
 
 def _as_type_of(old: Any, value: Any, path: str) -> Any:
@@ -176,17 +189,23 @@ def _as_type_of(old: Any, value: Any, path: str) -> Any:
             return Path(value)
         if isinstance(old, (tuple, list)) and isinstance(value, list):
             return type(old)(value)
-    kind = "a group of settings" if isinstance(old, dict) or dataclasses.is_dataclass(old) else type(old).__name__
+    kind = type(old).__name__
+    if isinstance(old, dict) or dataclasses.is_dataclass(old):
+        kind = "a group of settings"
     raise ValueError(f"override {path!r}: {value!r} is {type(value).__name__}, but the setting is {kind}.")
 
 
 def _row(value: Any, where: str, scenes: Mapping[str, Scene]) -> Row:
     row = _mapping(value, where, {"label", "method"}, {"scenes", "seeds", "overrides", "curve_every"})
-    names = None if row.get("scenes") is None else tuple(map(str, _list(row["scenes"], f"{where}.scenes")))
+    names = None
+    if row.get("scenes") is not None:
+        names = tuple(map(str, _list(row["scenes"], f"{where}.scenes")))
     for name in names or ():
         if name not in scenes:
             raise ValueError(f"{where}.scenes names {name!r}, which is not under scenes; add it there.")
-    seeds = None if row.get("seeds") is None else _seeds(row["seeds"], f"{where}.seeds")
+    seeds = None
+    if row.get("seeds") is not None:
+        seeds = _seeds(row["seeds"], f"{where}.seeds")
     every = row.get("curve_every")
     if every is not None and (type(every) is not int or every < 1):
         raise ValueError(f"curve_every must be a whole number of iterations from 1, not {every!r}.")
@@ -219,7 +238,8 @@ def _list(value: object, where: str) -> list[Any]:
 
 
 def _text(mapping: Mapping[str, Any], key: str, where: str) -> str:
-    if not isinstance(value := mapping[key], str) or not value:
+    value = mapping[key]
+    if not isinstance(value, str) or not value:
         raise ValueError(f"{where}.{key} must be text, not {value!r}; put it in quotes.")
     return value
 

@@ -38,12 +38,10 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     Raises ValueError, which names it, if there is no such method, dataparser, setting or data.
     """
     import torch
-    from nerfstudio.configs.dataparser_configs import all_dataparsers
     from nerfstudio.configs.method_configs import all_methods
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
     from nerfstudio.engine.trainer import TrainerConfig
 
-    from sadgs_ns.data.parsers import PARSERS
     from sadgs_ns.training.config import SadgsTrainerConfig
 
     config = copy.deepcopy(all_methods.get(row.method))
@@ -52,20 +50,9 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     datamanager = config.pipeline.datamanager
     if not isinstance(datamanager, FullImageDatamanagerConfig):
         raise ValueError(f"row {row.label!r}: {row.method!r} trains on rays; give a Gaussian splatting method.")
-    name = "blender-data" if scene.dataparser == "blender" else scene.dataparser
-    if name not in all_dataparsers:
-        known = ", ".join(sorted(all_dataparsers))
-        raise ValueError(f"scene {scene.name!r}: nerfstudio has no dataparser {name!r}; give one of {known}.")
     if not (root / scene.data).exists():
         raise ValueError(f"scene {scene.name!r}: {root / scene.data} does not exist; check --scenes.")
-    # As `ns-train METHOD PARSER` does: the method's own settings of its default parser, which may read SfM points.
-    own, registered = datamanager.dataparser, all_dataparsers[name]
-    if isinstance(config, SadgsTrainerConfig):
-        registered = PARSERS[name]
-    dataparser = copy.deepcopy(own if type(own) is type(registered) else registered)
-    for path, value in scene.options.items():
-        set_dotted(dataparser, path, value)
-    datamanager.dataparser = dataparser
+    datamanager.dataparser = _dataparser_of(scene, config)
     datamanager.data = root / scene.data
     for path, value in row.overrides.items():
         set_dotted(config, path, value)
@@ -78,10 +65,12 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     config.steps_per_save = 0
     if isinstance(config, SadgsTrainerConfig):
         config.seconds_per_save = 0
+    else:
+        # Of nerfstudio's own generator, which `machine.seed` leaves alone.
+        datamanager.train_cameras_sampling_seed = seed
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.output_dir = work
     config.machine.seed = seed
-    datamanager.train_cameras_sampling_seed = seed  # nerfstudio's own generator: the seed above leaves it alone
     if not torch.cuda.is_available():
         config.machine.device_type = "cpu"
         datamanager.cache_images = "gpu"  # "the model's device"; "cpu" pins memory, which needs CUDA
@@ -94,6 +83,35 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
     return config
 
 
+def _dataparser_of(scene: Scene, config: TrainerConfig) -> Any:
+    """The config of a scene's dataparser, for a method with this config.
+
+    It is what `ns-train METHOD PARSER` takes: of the method's default parser the method's own settings, which may read
+    SfM points. Raises ValueError if there is no such dataparser or setting.
+    """
+    from nerfstudio.configs.dataparser_configs import all_dataparsers
+
+    from sadgs_ns.data.parsers import PARSERS
+    from sadgs_ns.training.config import SadgsTrainerConfig
+
+    name = scene.dataparser
+    if name == "blender":
+        name = "blender-data"
+    if name not in all_dataparsers:
+        known = ", ".join(sorted(all_dataparsers))
+        raise ValueError(f"scene {scene.name!r}: nerfstudio has no dataparser {name!r}; give one of {known}.")
+    registered = all_dataparsers[name]
+    if isinstance(config, SadgsTrainerConfig):
+        registered = PARSERS[name]
+    own = config.pipeline.datamanager.dataparser  # type: ignore[attr-defined]
+    if type(own) is type(registered):
+        registered = own
+    dataparser = copy.deepcopy(registered)
+    for path, value in scene.options.items():
+        set_dotted(dataparser, path, value)
+    return dataparser
+
+
 def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
     """Train once on a scene below `root` and measure; nerfstudio writes to `work`, which the caller deletes.
 
@@ -102,7 +120,7 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         `initialization_seconds` (the model from the points), `load_seconds`, `warmup_seconds` and, where the method has
         them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
         alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (as other programs'
-        viewers draw) and what `coverage_of_views` tells. `differing_pixels` is what `viewpoints.pixels_that_differ`
+        viewers draw) and what `angles_of_views` tells. `differing_pixels` is what `viewpoints.pixels_that_differ`
         tells. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished run; no
         time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
@@ -239,46 +257,53 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float], aligned: 
 
         held_out |= aligned_quality(model, views, network)
     differing = viewpoints.pixels_that_differ(model, datamanager.train_dataset.cameras)
+    views_per_iteration = 1
+    if hasattr(model, "plan"):
+        views_per_iteration = model.plan.views_per_iteration
+    gpu = None
+    if torch.cuda.is_available():
+        gpu = torch.cuda.get_device_name()
     return {
         "iterations": trainer.config.max_num_iterations,
-        "views_per_iteration": model.plan.views_per_iteration if hasattr(model, "plan") else 1,
+        "views_per_iteration": views_per_iteration,
         "loop_seconds": timer.seconds,
         **seconds,
         **held_out,
-        **coverage_of_views(datamanager, model),
+        **angles_of_views(datamanager, model),
         "differing_pixels": differing,
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,
         "train_views": len(datamanager.train_dataset),
         "eval_views": len(views),
-        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
+        "gpu": gpu,
     }
 
 
-def coverage_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
+def angles_of_views(datamanager: Any, model: Any) -> dict[str, list[Any]]:
     """Tell how far the held-out views are from the training views, in the order in which they are evaluated.
 
     Without SfM points, the centres of the model's Gaussians are the points. The images must be loaded, because that
     takes the distortion from the cameras.
 
     Returns:
-        The images' names without suffix, and what `coverage` measures: degrees and shares, None in place of NaN.
+        The images' names without suffix, and the angles to the nearest training view in degrees; None in place of NaN.
     """
-    from benchmarks.coverage import Views, nearest_angles, uncovered_shares
+    from benchmarks.coverage import Views, nearest_angles
 
-    training, held_out = datamanager.train_dataset, datamanager.eval_dataset
+    training = datamanager.train_dataset
+    held_out = datamanager.eval_dataset
     points = training.metadata.get("points3D_xyz")
-    points = (model.means.detach() if points is None or not len(points) else points).to(model.device)
-    there, known = (Views.of(dataset.cameras.to(model.device)) for dataset in (held_out, training))
-
-    def rounded(values: Any, digits: int) -> list[float | None]:
-        return [None if math.isnan(value) else round(value, digits) for value in values.tolist()]
-
-    return {
-        "view_names": [Path(path).stem for path in held_out.image_filenames],
-        "view_angles": rounded(nearest_angles(there, known, points), 1),
-        "view_uncovered": rounded(uncovered_shares(there, known, points), 3),
-    }
+    if points is None or not len(points):
+        points = model.means.detach()
+    there = Views.of(held_out.cameras.to(model.device))
+    known = Views.of(training.cameras.to(model.device))
+    angles: list[float | None] = []
+    for angle in nearest_angles(there, known, points.to(model.device)).tolist():
+        if math.isnan(angle):
+            angles.append(None)
+        else:
+            angles.append(round(angle, 1))
+    return {"view_names": [Path(path).stem for path in held_out.image_filenames], "view_angles": angles}
 
 
 def load_in_one_process(job: Job, root: Path, work: Path, checkpoint: Path) -> Any:
@@ -313,7 +338,9 @@ def describe(error: Exception) -> str:
     if isinstance(error, (urllib.error.URLError, ConnectionError, TimeoutError)):
         file = "hub/checkpoints/alexnet-owt-7be5be79.pth"
         return f"nerfstudio could not download the LPIPS weights; set TORCH_HOME to a folder that holds {file}."
-    return message if isinstance(error, ValueError) else f"{type(error).__name__}: {message}"
+    if isinstance(error, ValueError):
+        return message
+    return f"{type(error).__name__}: {message}"
 
 
 def main() -> None:
@@ -321,7 +348,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.run", description="Measure one training run.")
     parser.add_argument("--spec", required=True, help="JSON of a job, with the root of the scenes")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    arguments, rank = parser.parse_args(), os.environ.get("RANK", "0")
+    arguments = parser.parse_args()
+    rank = os.environ.get("RANK", "0")
     spec = json.loads(arguments.spec)
     job = Job(Scene(**spec["scene"]), Row(**spec["row"]), spec["seed"])
     date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")

@@ -51,7 +51,9 @@ class Step:
     def __init__(
         self, gaussians: int, width: int, height: int, views: int = 1, device: torch.device | str = "cuda"
     ) -> None:
-        self.width, self.height, self.views = width, height, views
+        self.width = width
+        self.height = height
+        self.views = views
         device = torch.device(device)
         generator = torch.Generator(device).manual_seed(0)
 
@@ -77,7 +79,8 @@ class Step:
         angles = torch.arange(views, device=device) * (2 * math.pi / views)
         self.viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
         self.viewmats[:, 0, 0] = self.viewmats[:, 2, 2] = angles.cos()
-        self.viewmats[:, 0, 2], self.viewmats[:, 2, 0] = angles.sin(), -angles.sin()
+        self.viewmats[:, 0, 2] = angles.sin()
+        self.viewmats[:, 2, 0] = -angles.sin()
         self.viewmats[:, 2, 3] = 1.6
         K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]], device=device)
         self.Ks = K.repeat(views, 1, 1)
@@ -91,7 +94,8 @@ class Step:
     def draw(self) -> Tensor:
         """Rasterize the views. [V, H, W, 3]"""
         p = self.params
-        opacities, colors = p["opacities"].sigmoid().squeeze(-1), (p["features_dc"], p["features_rest"])
+        opacities = p["opacities"].sigmoid().squeeze(-1)
+        colors = (p["features_dc"], p["features_rest"])
         gaussians = Gaussians(p["means"], p["quats"], p["scales"].exp(), opacities, colors)
         cameras = Cameras(self.viewmats, self.Ks, self.width, self.height)
         options = RenderOptions(sh_degree=3, absgrad=True, tile_capacity=self.capacity)

@@ -1,4 +1,4 @@
-"""Results as Markdown tables, of a results file or of the rows that the documents cite, and plots of a results file."""
+"""Results as Markdown tables, of a results file or of the rows that the documents cite."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from tyro.conf import Positional
-
-from benchmarks import results
 from benchmarks.results import Result
 
 Groups = Mapping[tuple[str, str], Sequence[Result]]
@@ -26,20 +22,30 @@ def number(value: float | None, digits: int, signed: bool = False) -> str:
         return NOTHING
     rounded = round(value, digits)
     text = f"{abs(rounded):.{digits}f}"
-    text = text.removeprefix("0") if digits > 1 else text
-    return ("−" if rounded < 0 else "+" if rounded > 0 and signed else "") + text
+    if digits > 1:
+        text = text.removeprefix("0")
+    if rounded < 0:
+        return f"−{text}"
+    if rounded > 0 and signed:
+        return f"+{text}"
+    return text
 
 
 def count(value: float) -> str:
     """How many Gaussians: thousands, from ten thousand on."""
-    return f"{value:,.0f}" if value < 10_000 else f"{value / 1000:,.0f}k"
+    if value < 10_000:
+        return f"{value:,.0f}"
+    return f"{value / 1000:,.0f}k"
 
 
 def grid(header: Sequence[str], lines: Iterable[Sequence[str]], names: int = 1) -> str:
     """Cells as a Markdown table; the first `names` columns are aligned to the left, the others to the right."""
     rule = ["---"] * names + ["---:"] * (len(header) - names)
-    cells = ([cell.replace("|", "\\|") for cell in line] for line in (header, rule, *lines))
-    return "\n".join("| " + " | ".join(line) + " |" for line in cells)
+    text = []
+    for line in (header, rule, *lines):
+        cells = [cell.replace("|", "\\|") for cell in line]
+        text.append("| " + " | ".join(cells) + " |")
+    return "\n".join(text)
 
 
 def latest(rows: Iterable[Result]) -> list[Result]:
@@ -59,13 +65,16 @@ def groups(rows: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
 
 def values(group: Iterable[Result], name: str) -> list[float]:
     """A field of the results that have it."""
-    return [value for row in group if (value := row.get(name)) is not None]
+    found = [row.get(name) for row in group]
+    return [value for value in found if value is not None]
 
 
 def mean(group: Iterable[Result], name: str) -> float | None:
     """Mean of a field over the results that have it; None if none does."""
     known = values(group, name)
-    return statistics.fmean(known) if known else None
+    if not known:
+        return None
+    return statistics.fmean(known)
 
 
 Cell = Sequence[Sequence[Result]]
@@ -74,18 +83,26 @@ Cell = Sequence[Sequence[Result]]
 
 def mean_over_scenes(cell: Cell, name: str) -> float | None:
     """Mean over scenes of the means over seeds; None if a scene has no number."""
-    known = [value for group in cell if (value := mean(group, name)) is not None]
-    return statistics.fmean(known) if known and len(known) == len(cell) else None
+    means = [mean(group, name) for group in cell]
+    known = [value for value in means if value is not None]
+    if not known or len(known) < len(cell):
+        return None
+    return statistics.fmean(known)
 
 
 def deviation(cell: Cell, name: str) -> float | None:
     """Pooled standard deviation over the seeds of all scenes; None if these say less than three seeds of one scene."""
-    known = [numbers for group in cell if len(numbers := values(group, name)) > 1]
-    freedom = sum(len(numbers) - 1 for numbers in known)
+    squares = []
+    freedom = 0
+    for group in cell:
+        numbers = values(group, name)
+        if len(numbers) > 1:
+            squares.append((len(numbers) - 1) * statistics.variance(numbers))
+            freedom += len(numbers) - 1
     if freedom < 2:
         return None
     # `sum` rounds differently from Python 3.12 on.
-    return math.sqrt(math.fsum((len(numbers) - 1) * statistics.variance(numbers) for numbers in known) / freedom)
+    return math.sqrt(math.fsum(squares) / freedom)
 
 
 def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float | None:
@@ -93,13 +110,22 @@ def seconds_to_match(run: Result, goal: Mapping[str, float | None]) -> float | N
 
     Infinity if it never has, None if there is no goal or the run was not measured so on its way.
     """
-    names, curve = [name for name in DIGITS if goal.get(name) is not None], run.get("curve") or []
+    names = [name for name in DIGITS if goal.get(name) is not None]
+    curve = run.get("curve") or []
     if not names or not curve or any(point.get(name) is None for point in curve for name in names):
         return None
     for point in curve:
-        if all(point[name] <= goal[name] if name == "lpips" else point[name] >= goal[name] for name in names):
+        if all(_is_as_good(name, point[name], goal[name]) for name in names):
             return point["seconds"]
     return math.inf
+
+
+def _is_as_good(name: str, value: float, goal: float | None) -> bool:
+    """Whether a measure is as good as a goal, which is known; less LPIPS is better, more of the others."""
+    assert goal is not None
+    if name == "lpips":
+        return value <= goal
+    return value >= goal
 
 
 @dataclass(frozen=True)
@@ -116,7 +142,8 @@ class Run:
 
     def mean(self, field: str) -> float:
         """Mean over scenes and seeds; raises ValueError if no result has that number."""
-        if (value := mean_over_scenes(self.cell, field)) is None:
+        value = mean_over_scenes(self.cell, field)
+        if value is None:
             raise ValueError(f"{self.cell[0][0]['key']} has no {field}; leave that column out.")
         return value
 
@@ -125,36 +152,53 @@ class Run:
         known = [value for group in self.cell for value in values(group, field)]
         if len(known) == 2 and len(self.cell) == 1:
             return ", ".join(number(value, digits) for value in known)
+        text = number(self.mean(field), digits)
         spread = deviation(self.cell, field)
-        return number(self.mean(field), digits) + ("" if spread is None else f" ± {number(spread, digits)}")
+        if spread is None:
+            return text
+        return f"{text} ± {number(spread, digits)}"
 
     def seconds(self) -> str:
         """Loop seconds of which three digits count."""
-        return number(self.mean("loop_seconds"), 0 if self.mean("loop_seconds") >= 100 else 1)
+        return _three_digits(self.mean("loop_seconds"))
 
     def ratio(self, form: Callable[[float], str]) -> str:
         """Loop seconds, relative to those of `base`."""
         seconds = mean_over_scenes(self.base, "loop_seconds")
-        return NOTHING if seconds is None else form(self.mean("loop_seconds") / seconds)
+        if seconds is None:
+            return NOTHING
+        return form(self.mean("loop_seconds") / seconds)
 
     def matched(self) -> str:
         """Median of the loop seconds at which runs first match the last quality of `base`; a run of `base` its own."""
         found = []
         for group, base in zip(self.cell, self.base, strict=False):
             goal = {name: mean(base, name) for name in DIGITS}
-            timed = [run for run in group if run.get("loop_seconds") is not None]  # Others ran on another host.
-            found += [seconds_to_match(run, run if any(run is other for other in base) else goal) for run in timed]
+            for run in group:
+                if run.get("loop_seconds") is None:  # It ran on another host.
+                    continue
+                if any(run is other for other in base):
+                    found.append(seconds_to_match(run, run))
+                else:
+                    found.append(seconds_to_match(run, goal))
         if None in found or not found:
             return NOTHING
         seconds = statistics.median(value for value in found if value is not None)
-        return "never" if math.isinf(seconds) else number(seconds, 0 if seconds >= 100 else 1)
+        if math.isinf(seconds):
+            return "never"
+        return _three_digits(seconds)
 
     def views(self) -> list[list[float]]:
         """PSNR of each held-out view of all scenes, over the seeds; raises ValueError if a run does not tell it."""
         runs = [run for group in self.cell for run in group]
-        if without := [run["key"] for run in runs if not run.get("view_psnr")]:
-            raise ValueError(f"{without[0]} has no view_psnr; leave that column out.")
-        return [list(view) for group in self.cell for view in zip(*(run["view_psnr"] for run in group), strict=True)]
+        for run in runs:
+            if not run.get("view_psnr"):
+                raise ValueError(f"{run['key']} has no view_psnr; leave that column out.")
+        found = []
+        for group in self.cell:
+            of_runs = [run["view_psnr"] for run in group]
+            found += [list(view) for view in zip(*of_runs, strict=True)]
+        return found
 
     def median_view(self) -> str:
         """Median over views of the means over seeds."""
@@ -167,12 +211,23 @@ class Run:
     def seeds(self) -> str:
         """The least number of runs of a scene, and how many scenes there are if several."""
         seeds = str(min(map(len, self.cell)))
-        return seeds if len(self.cell) == 1 else f"{len(self.cell)} × {seeds}"
+        if len(self.cell) == 1:
+            return seeds
+        return f"{len(self.cell)} × {seeds}"
 
     def photos(self) -> str:
         """The scene, and how many training views of what size it has."""
-        size = "" if self.megapixels is None else f" of {self.megapixels} MP"
-        return f"{self.scene}: {self.mean('train_views'):.0f}{size}"
+        text = f"{self.scene}: {self.mean('train_views'):.0f}"
+        if self.megapixels is None:
+            return text
+        return f"{text} of {self.megapixels} MP"
+
+
+def _three_digits(seconds: float) -> str:
+    """Seconds with one decimal below 100."""
+    if seconds >= 100:
+        return number(seconds, 0)
+    return number(seconds, 1)
 
 
 def _spread(field: str, digits: int) -> Callable[[Run], str]:
@@ -180,7 +235,9 @@ def _spread(field: str, digits: int) -> Callable[[Run], str]:
 
 
 def _fraction(ratio: float) -> str:
-    return "1" if ratio == 1 else f"1/{1 / ratio:.0f}"
+    if ratio == 1:
+        return "1"
+    return f"1/{1 / ratio:.0f}"
 
 
 COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
@@ -232,7 +289,8 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) ->
                 raise
             return NOTHING
 
-    if unknown := {*columns} - COLUMNS.keys():
+    unknown = {*columns} - COLUMNS.keys()
+    if unknown:
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
     known = [COLUMNS[name] for name in columns]
     lines = [[cell(column, run) for _, column in known] for run in runs]
@@ -252,31 +310,55 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
     """
     last = latest(rows)
     grouped = groups(last)
-    bases = {scene: grouped.get((scene, reference or ""), []) for scene, _ in grouped}
-    runs = [Run(scene, label, [group], [bases[scene]]) for (scene, label), group in grouped.items()]
+    runs = []
+    for (scene, label), group in grouped.items():
+        base = grouped.get((scene, reference or ""), [])
+        runs.append(Run(scene, label, [group], [base]))
+    columns: list[str] = [*_PRINTED]
+    if any(row.get("aligned_psnr") is not None for row in last):
+        place = columns.index("gaussians")
+        columns[place:place] = ["aligned_psnr", "aligned_ssim", "aligned_lpips"]
+    lines = [of_runs(runs, columns, strict=False)]
+    sentences = [*_spreads_over_scenes(grouped), *_faults(last)]
+    if sentences:
+        lines.append("")
+    lines += [f"- {sentence}" for sentence in sentences]
+    return "\n".join(lines)
+
+
+def _spreads_over_scenes(grouped: Groups) -> list[str]:
+    """Sentences on how much the seeds of each label differ over all scenes."""
     sentences = []
     for label in dict.fromkeys(label for _, label in grouped):
         cell = [group for (_, other), group in grouped.items() if other == label]
-        if (told := _deviations(cell)) != NOTHING and len(cell) > 1:
+        spread = _deviations(cell)
+        if spread != NOTHING and len(cell) > 1:
             sentences.append(
-                f"{label}: pooled standard deviation {told} of PSNR, SSIM and LPIPS over {len(cell)} scenes."
+                f"{label}: pooled standard deviation {spread} of PSNR, SSIM and LPIPS over {len(cell)} scenes."
             )
-    sentences += [f"{r['scene']}, {r['label']}, seed {r['seed']} failed: {r['error']}" for r in last if r.get("error")]
-    if any(row.get("jobs_per_gpu", 1) > 1 for row in last):
+    return sentences
+
+
+def _faults(rows: Sequence[Result]) -> list[str]:
+    """Sentences on failed runs, runs that shared a GPU, and rows of several commits."""
+    sentences = []
+    commits = set()
+    for row in rows:
+        error = row.get("error")
+        if error:
+            sentences.append(f"{row['scene']}, {row['label']}, seed {row['seed']} failed: {error}")
+        elif str(row.get("method")).startswith("sadgs"):
+            versions = row.get("versions") or {}
+            commits.add((versions.get("commit") or "")[:7])
+    if any(row.get("jobs_per_gpu", 1) > 1 for row in rows):
         sentences.append("Some runs shared a GPU: their times are not comparable.")
-    ours = [row for row in last if str(row.get("method")).startswith("sadgs") and not row.get("error")]
-    commits = {commit[:7] for row in ours if (commit := (row.get("versions") or {}).get("commit"))}
+    commits.discard("")
     if len(commits) > 1:
         sentences.append(
             f"The rows of sadgs are of several commits ({', '.join(sorted(commits))}); a run is made again when its "
             "line is deleted."
         )
-    columns: list[str] = [*_PRINTED]
-    if any(row.get("aligned_psnr") is not None for row in last):
-        place = columns.index("gaussians")
-        columns[place:place] = ["aligned_psnr", "aligned_ssim", "aligned_lpips"]
-    text = of_runs(runs, columns, strict=False)
-    return "\n".join([text, *([""] if sentences else []), *(f"- {sentence}" for sentence in sentences)])
+    return sentences
 
 
 def of_sweep(found: Groups, labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
@@ -288,16 +370,29 @@ def of_sweep(found: Groups, labels: Mapping[str, str], scenes: Mapping[str, Sequ
     for label in labels:
         if label not in {other for _, other in found}:
             raise ValueError(f"the rows have no row {label!r}.")
-    (first, name), *others = labels.items()
-    cells = {other: [[found.get((s, other), []) for s in column] for column in scenes.values()] for other in labels}
-    for scene in (scene for column in scenes.values() for scene in column):
-        group_of(found, scene, first)
-    spreads = [_deviations([group for other in labels for group in cells[other][i]]) for i in range(len(scenes))]
-    lines = [[name, *map(_absolute, cells[first])], ["standard deviation", *spreads]]
-    for label, name in others:
-        pairs = zip(cells[label], cells[first], strict=True)
-        lines.append([name, *(_difference(*pair) + _few(*pair) if all(pair[0]) else NOTHING for pair in pairs)])
+    first, *others = labels
+    spreads = []
+    for column in scenes.values():
+        for scene in column:
+            group_of(found, scene, first)
+        spreads.append(_deviations([group for label in labels for group in _cell(found, column, label)]))
+    bases = [_cell(found, column, first) for column in scenes.values()]
+    lines = [[labels[first], *map(_absolute, bases)], ["standard deviation", *spreads]]
+    for label in others:
+        line = [labels[label]]
+        for column, base in zip(scenes.values(), bases, strict=True):
+            cell = _cell(found, column, label)
+            if all(cell):
+                line.append(_difference(cell, base) + _few(cell, base))
+            else:
+                line.append(NOTHING)
+        lines.append(line)
     return grid(["Setting", *scenes], lines)
+
+
+def _cell(found: Groups, scenes: Iterable[str], label: str) -> Cell:
+    """The runs of a label on some scenes; none where there are none."""
+    return [found.get((scene, label), []) for scene in scenes]
 
 
 @dataclass(frozen=True)
@@ -343,14 +438,20 @@ def _absolute(cell: Cell) -> str:
 def _deviations(cell: Cell) -> str:
     """Those of PSNR, SSIM and LPIPS."""
     spreads = [number(deviation(cell, field), digits) for field, digits in DIGITS.items()]
-    return NOTHING if spreads[0] == NOTHING else " / ".join(spreads)
+    if spreads[0] == NOTHING:
+        return NOTHING
+    return " / ".join(spreads)
 
 
 def _difference(cell: Cell, base: Cell) -> str:
     parts = []
     for field, digits in DIGITS.items():
-        new, old = mean_over_scenes(cell, field), mean_over_scenes(base, field)
-        parts.append(NOTHING if new is None or old is None else number(new - old, digits, signed=True))
+        new = mean_over_scenes(cell, field)
+        old = mean_over_scenes(base, field)
+        if new is None or old is None:
+            parts.append(NOTHING)
+        else:
+            parts.append(number(new - old, digits, signed=True))
     ratio = (mean_over_scenes(cell, "gaussians") or 0) / (mean_over_scenes(base, "gaussians") or 1)
     return " / ".join([*parts, f"×{ratio:.2f}"])
 
@@ -365,11 +466,16 @@ def _range(differences: Sequence[str]) -> str:
     if NOTHING in differences:
         return NOTHING
     ordered = sorted(differences, key=lambda text: float(text.replace("−", "-").lstrip("×")))
-    return ordered[0] if ordered[0] == ordered[-1] else f"{ordered[0]} to {ordered[-1].lstrip('×')}"
+    least, most = ordered[0], ordered[-1]
+    if least == most:
+        return least
+    return f"{least} to {most.lstrip('×')}"
 
 
 def _short(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2g}"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.2g}"
 
 
 _ERRORS = {"median": "{}, median", "p95": "{}, 95 %", "max": "{}, max", "flips": "η > 1 flips"}
@@ -386,36 +492,15 @@ def of_approximations(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rows of one of `approximations`' tables; a number that is None is a dash."""
 
     def cell(name: str, value: float | None) -> str:
-        return NOTHING if value is None else f"{_short(100 * value)} %" if name in _ERRORS else _short(value)
+        if value is None:
+            return NOTHING
+        if name in _ERRORS:
+            return f"{_short(100 * value)} %"
+        return _short(value)
 
     columns = APPROXIMATIONS[rows[0]["table"]]
-    lines = ((row["variant"], *(cell(name, row[name]) for name in columns)) for row in rows)
-    return grid(("Variant", *columns.values()), lines)
-
-
-@dataclass
-class Command:
-    """Print the table of a results file, and plot quality against time."""
-
-    results: Positional[Path]
-    """JSON-lines file that python -m benchmarks wrote"""
-    reference: str | None = None
-    """label of the row that the columns Ratio and Matched compare with"""
-    plots: Path | None = None
-    """folder that takes quality-time.png"""
-
-    def __call__(self) -> int:
-        rows = results.read(self.results)
-        grouped = groups(latest(rows))
-        if not grouped:
-            raise ValueError(f"{self.results} has no successful run among its {len(rows)}.")
-        labels = dict.fromkeys(label for _, label in grouped)
-        if self.reference is not None and self.reference not in labels:
-            raise ValueError(f"--reference {self.reference!r} is no label of these: {', '.join(labels)}.")
-        print(markdown(rows, self.reference))
-        if self.plots is not None:
-            from benchmarks import plots
-
-            self.plots.mkdir(parents=True, exist_ok=True)
-            plots.save(plots.quality(grouped.items()), self.plots / "quality-time.png")
-        return 0
+    lines = []
+    for row in rows:
+        cells = [cell(name, row[name]) for name in columns]
+        lines.append([row["variant"], *cells])
+    return grid(["Variant", *columns.values()], lines)

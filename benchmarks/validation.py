@@ -25,8 +25,12 @@ from benchmarks.datasets import image_names
 
 SPARSE = Path("sparse/0")
 """Folder of a COLMAP scene's model."""
-INTERVAL, TEST, VALIDATION = 8, 0, 4
-"""Every 8th view from 0 is a test view, every 8th from 4 a validation view."""
+INTERVAL = 8
+"""Every so many views, one is held out."""
+TEST = 0
+"""Number of the first test view."""
+VALIDATION = 4
+"""Number of the first validation view."""
 NOISY_DEGREES = 0.1
 """Standard deviation of the angle by which `--noisy` turns a camera about each of its axes: 2 px at a focal length of
 1,150 px."""
@@ -80,7 +84,9 @@ def write_transforms(scene: Path, out: Path, fold: int = VALIDATION) -> tuple[in
             (out / path.name).symlink_to(path.resolve())
     content = json.loads((scene / "transforms.json").read_text())
     names = content["train_filenames"]
-    held_out = content["test_filenames"] if fold == TEST else names[fold::INTERVAL]
+    held_out = names[fold::INTERVAL]
+    if fold == TEST:
+        held_out = content["test_filenames"]
     train = [name for name in names if name not in held_out]
     listed = {*train, *held_out}
     content["frames"] = [frame for frame in content["frames"] if frame["file_path"] in listed]
@@ -103,17 +109,24 @@ class Command:
     """scenes of which NAME-noisy is written, too"""
 
     def __call__(self) -> int:
-        folds = [str(VALIDATION)] if self.folds is None else self.folds.split(",")
+        folds = [str(VALIDATION)]
+        if self.folds is not None:
+            folds = self.folds.split(",")
         if not {*folds} <= {str(fold) for fold in range(INTERVAL)}:
             raise ValueError(
                 f"--folds must be whole numbers from 0 to {INTERVAL - 1}, such as 2,4,6, not {self.folds!r}."
             )
-        folders = sorted(path for path in self.root.iterdir() if path.is_dir()) if self.root.is_dir() else []
-        scenes = [path for path in folders if (path / SPARSE).is_dir() or (path / "transforms.json").exists()]
+        scenes = []
+        if self.root.is_dir():
+            for folder in sorted(self.root.iterdir()):
+                if (folder / SPARSE).is_dir() or (folder / "transforms.json").exists():
+                    scenes.append(folder)
         if not scenes:
             raise ValueError(f"{self.root} holds no folder with {SPARSE} or transforms.json; give that of the scenes.")
         for scene, fold in product(scenes, map(int, folds)):
-            name = scene.name if self.folds is None else f"{scene.name}-{fold}"
+            name = scene.name
+            if self.folds is not None:
+                name = f"{name}-{fold}"
             if (scene / SPARSE).is_dir():
                 train, held_out = write_colmap(scene, self.out / name, fold)
                 if scene.name in self.noisy:

@@ -29,10 +29,14 @@ def load(paths: Iterable[Path]) -> dict[str, dict[str, list[Result]]]:
     """Read the latest runs by scene and label; those without `view_psnr` are left out with one line on stderr."""
     rows = [row for path in paths for row in results.read(path)]
     found: dict[str, dict[str, list[Result]]] = {}
-    for row in (latest := table.latest(rows)):
+    without = []
+    for row in table.latest(rows):
         if row.get("view_psnr"):
-            found.setdefault(row["scene"], {}).setdefault(row["label"], []).append(row)
-    if without := [row["key"] for row in latest if not row.get("view_psnr")]:
+            of_scene = found.setdefault(row["scene"], {})
+            of_scene.setdefault(row["label"], []).append(row)
+        else:
+            without.append(row["key"])
+    if without:
         print(f"Runs without view_psnr are skipped, {len(without)} of them, such as {without[0]}.", file=sys.stderr)
     return found
 
@@ -42,27 +46,33 @@ def view_names(scene: str, runs: Iterable[Result]) -> list[str]:
 
     Raises ValueError if two runs have different numbers of views, or different names.
     """
-    told = [(len(row["view_psnr"]), row.get("view_names")) for row in runs]
-    names = next((names for _, names in told if names), [str(view) for view in range(told[0][0])])
-    if any(count != len(names) or (others or names) != names for count, others in told):
+    runs = list(runs)
+    numbers = [str(view) for view in range(len(runs[0]["view_psnr"]))]
+    lists = [row["view_names"] for row in runs if row.get("view_names")]
+    names = next(iter(lists), numbers)
+    same_names = all(others == names for others in lists)
+    same_number = all(len(row["view_psnr"]) == len(names) for row in runs)
+    if not same_names or not same_number:
         raise ValueError(f"the runs of {scene} hold out different views; give files of one split at a time.")
     return names
 
 
 def references(runs: Runs) -> list[float]:
     """Return the best label's median over seeds of each view's PSNR in dB, empty without runs."""
-    medians = [[statistics.median(view) for view in _by_view(group)] for group in runs.values()]
+    medians = []
+    for group in runs.values():
+        medians.append([statistics.median(view) for view in _by_view(group)])
     return [max(view) for view in zip(*medians, strict=True)]
 
 
 def far_behind(group: Sequence[Result], reference: Sequence[float]) -> list[tuple[int, Any]]:
     """Return the pairs of a view's number and a seed in which one label's view lies far under its reference."""
-    return [
-        (view, row["seed"])
-        for view, best in enumerate(reference)
-        for row in group
-        if _is_far(row["view_psnr"][view], best)
-    ]
+    pairs = []
+    for view, best in enumerate(reference):
+        for row in group:
+            if _is_far(row["view_psnr"][view], best):
+                pairs.append((view, row["seed"]))
+    return pairs
 
 
 def collapsed(group: Sequence[Result]) -> list[tuple[int, Any]]:
@@ -92,20 +102,20 @@ def markdown(scene: str, runs: Runs, names: Sequence[str], reference: Sequence[f
     every = [row for group in runs.values() for row in group]
     lines = []
     for i, name in enumerate(names):
-        told = (_known(every, "view_angles", i, ".1f"), _known(every, "view_uncovered", i, ".3f"))
-        lines.append((name, *told, *(_mean_and_deviation(_by_view(group)[i]) for group in runs.values())))
-    text = [f"## {scene}", "", table.grid(("View", "Angle °", "Uncovered", *runs), lines), ""]
+        cells = [_mean_and_deviation(_by_view(group)[i]) for group in runs.values()]
+        lines.append([name, _known_angle(every, i), *cells])
+    text = [f"## {scene}", "", table.grid(["View", "Angle °", *runs], lines), ""]
     for label, group in runs.items():
         median = statistics.median(statistics.fmean(view) for view in _by_view(group))
         lowest, worst = min((psnr, i) for row in group for i, psnr in enumerate(row["view_psnr"]))
-        told = [f"median {median:.2f} dB", f"worst view {names[worst]}, {lowest:.2f} dB"]
+        parts = [f"median {median:.2f} dB", f"worst view {names[worst]}, {lowest:.2f} dB"]
         if reference:
-            told.append(f"far behind: {_listed(names, far_behind(group, reference))}")
+            parts.append(f"far behind: {_listed(names, far_behind(group, reference))}")
         else:
-            told.append("there is no reference")
+            parts.append("there is no reference")
         if len(group) > 1:
-            told.append(f"collapsed: {_listed(names, collapsed(group))}")
-        text.append(f"- {label}: {'; '.join(told)}")
+            parts.append(f"collapsed: {_listed(names, collapsed(group))}")
+        text.append(f"- {label}: {'; '.join(parts)}")
     return "\n".join(text)
 
 
@@ -118,14 +128,25 @@ def _by_view(group: Sequence[Result]) -> list[tuple[float, ...]]:
     return list(zip(*(row["view_psnr"] for row in group), strict=True))
 
 
-def _known(rows: Iterable[Result], field: str, view: int, form: str) -> str:
-    values = [row[field][view] for row in rows if row.get(field) and row[field][view] is not None]
-    return format(statistics.median(values), form) if values else "–"
+def _known_angle(rows: Iterable[Result], view: int) -> str:
+    """The median of the angles in degrees that rows have of a view."""
+    angles = []
+    for row in rows:
+        angle = None
+        if row.get("view_angles"):
+            angle = row["view_angles"][view]
+        if angle is not None:
+            angles.append(angle)
+    if not angles:
+        return table.NOTHING
+    return f"{statistics.median(angles):.1f}"
 
 
 def _mean_and_deviation(values: Sequence[float]) -> str:
-    deviation = f" ± {statistics.stdev(values):.2f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):.2f}{deviation}"
+    mean = f"{statistics.fmean(values):.2f}"
+    if len(values) < 2:
+        return mean
+    return f"{mean} ± {statistics.stdev(values):.2f}"
 
 
 @dataclass
@@ -138,10 +159,12 @@ class Command:
     """files whose runs alone make the references (default: the results)"""
 
     def __call__(self) -> int:
-        behind: dict[str, tuple[int, int]] = {}  # pairs that are far behind, and all that have a reference
-        lost: dict[str, tuple[int, int]] = {}  # pairs that collapsed, and all whose label has other seeds
+        behind: dict[str, tuple[int, int]] = {}  # Pairs that are far behind, and all that have a reference.
+        lost: dict[str, tuple[int, int]] = {}  # Pairs that collapsed, and all whose label has other seeds.
         scenes = load(self.results)
-        frozen = load(self.references) if self.references else scenes
+        frozen = scenes
+        if self.references:
+            frozen = load(self.references)
         for scene, runs in scenes.items():
             others = frozen.get(scene, {})
             names = view_names(scene, [row for group in (*runs.values(), *others.values()) for row in group])
@@ -149,11 +172,14 @@ class Command:
             print(markdown(scene, runs, names, reference), end="\n\n")
             for label, group in runs.items():
                 bad, judged = behind.get(label, (0, 0))
-                behind[label] = bad + len(far_behind(group, reference)), judged + len(group) * len(reference)
+                bad += len(far_behind(group, reference))
+                judged += len(group) * len(reference)
+                behind[label] = (bad, judged)
                 bad, judged = lost.get(label, (0, 0))
+                bad += len(collapsed(group))
                 if len(group) > 1:
                     judged += len(group) * len(names)
-                lost[label] = bad + len(collapsed(group)), judged
+                lost[label] = (bad, judged)
         for label, (bad, judged) in behind.items():
             print(f"{label}: {bad} of {judged} (view, run) pairs are far behind", end="; ")
             bad, judged = lost[label]

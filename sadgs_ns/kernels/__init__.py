@@ -57,7 +57,8 @@ def triton_switched(on: bool) -> Iterator[None]:
     Without CUDA, Triton runs them in its interpreter if `TRITON_INTERPRET` is 1 when they are imported.
     """
     global _forced
-    before, _forced = _forced, on
+    before = _forced
+    _forced = on
     try:
         yield
     finally:

@@ -43,7 +43,8 @@ def _activate_backward(
         exists = i < 3 * size
         tl.store(v_log_scales + i, tl.load(v_scales + i, exists, 0.0) * tl.load(scales + i, exists, 0.0), exists)
     g = program * LANES + lane
-    opacity, v = tl.load(opacities + g, g < size, 0.0), tl.load(v_opacities + g * row, g < size, 0.0)
+    opacity = tl.load(opacities + g, g < size, 0.0)
+    v = tl.load(v_opacities + g * row, g < size, 0.0)
     if PENALTY:
         v += penalty * tl.load(v_penalty)
     tl.store(v_logits + g, v * (1 - opacity) * opacity, g < size)
@@ -53,7 +54,8 @@ class _Activate(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, log_scales: Tensor, logits: Tensor, weight: float) -> tuple[Tensor, Tensor, Tensor]:
         n = len(logits)
-        scales, opacities = torch.empty_like(log_scales), logits.new_empty(n)
+        scales = torch.empty_like(log_scales)
+        opacities = logits.new_empty(n)
         sums = logits.new_empty(cdiv(n, _LANES))
         _activate[len(sums),](log_scales, logits, scales, opacities, sums, n, weight, _LANES)
         ctx.save_for_backward(scales, opacities)
@@ -70,7 +72,8 @@ class _Activate(torch.autograd.Function):
         n = len(opacities)
         v_scales = torch.zeros_like(scales) if v_scales is None else v_scales.contiguous()
         v_opacities = torch.zeros_like(opacities) if v_opacities is None else v_opacities
-        v_log_scales, v_logits = torch.empty_like(scales), opacities.new_empty((n, 1))
+        v_log_scales = torch.empty_like(scales)
+        v_logits = opacities.new_empty((n, 1))
         # The partial sums all have the gradient of their sum, so the kernel reads the first one's.
         _activate_backward[cdiv(n, _LANES),](
             scales, opacities, v_scales, v_opacities, opacities if v_sums is None else v_sums, v_log_scales, v_logits,

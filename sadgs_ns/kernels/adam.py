@@ -33,29 +33,42 @@ def _update(
     """
     block = tl.program_id(0).to(tl.int64)
     n = rows.to(tl.int64) * WIDTHS[0]
-    parameter, gradient, rate = parameters[0], gradients[0], rates[0]
-    mean, square, scale = means[0], squares[0], scales[0]
+    parameter = parameters[0]
+    gradient = gradients[0]
+    rate = rates[0]
+    mean = means[0]
+    square = squares[0]
+    scale = scales[0]
     for k in tl.static_range(1, len(WIDTHS)):
         if block * BLOCK >= n:  # the block belongs to a later parameter
             block -= tl.cdiv(n, BLOCK)
             n = rows.to(tl.int64) * WIDTHS[k]
-            parameter, gradient, rate = parameters[k], gradients[k], rates[k]
-            mean, square, scale = means[k], squares[k], scales[k]
+            parameter = parameters[k]
+            gradient = gradients[k]
+            rate = rates[k]
+            mean = means[k]
+            square = squares[k]
+            scale = scales[k]
     drawn = FLAGS == 0
     for k in tl.static_range(FLAGS):
         drawn = drawn | (tl.load(overflowed[k]) == 0)
     n = tl.where(drawn, n, 0)
-    rate, scale = tl.load(rate), tl.load(scale)
+    rate = tl.load(rate)
+    scale = tl.load(scale)
     i = block * BLOCK + tl.arange(0, BLOCK)
     if (block + 1) * BLOCK <= n:  # the block is whole: without a mask, memory is read in wide words
-        g, m, v = tl.load(gradient + i), tl.load(mean + i), tl.load(square + i)
+        g = tl.load(gradient + i)
+        m = tl.load(mean + i)
+        v = tl.load(square + i)
         m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, i < n, MAX)
         tl.store(mean + i, m)
         tl.store(square + i, v)
         tl.store(parameter + i, tl.load(parameter + i) - change)
     else:
         exists = i < n
-        g, m, v = tl.load(gradient + i, exists), tl.load(mean + i, exists), tl.load(square + i, exists)
+        g = tl.load(gradient + i, exists)
+        m = tl.load(mean + i, exists)
+        v = tl.load(square + i, exists)
         m, v, change = _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, exists, MAX)
         tl.store(mean + i, m, exists)
         tl.store(square + i, v, exists)

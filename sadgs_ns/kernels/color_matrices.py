@@ -50,7 +50,9 @@ def _correct_backward(
         opacity = tl.load(alpha + pixel, exists, 0.0)
         r, g, b = load3(render, 3 * pixel, exists)
     v_r = tl.zeros([LANES], tl.float32)
-    v_g, v_b, v_opacity = v_r, v_r, v_r
+    v_g = v_r
+    v_b = v_r
+    v_opacity = v_r
     part = sums + 12 * (view * tl.num_programs(0) + tl.program_id(0))
     for k in tl.static_range(3):
         row = matrices + 12 * view + 4 * k
@@ -82,7 +84,8 @@ class _CorrectColors(torch.autograd.Function):
         render, alpha, matrices = ctx.saved_tensors
         views, height, width, _ = render.shape
         grid = (cdiv(height * width, _LANES), views)
-        v_render, v_alpha = torch.empty_like(render), torch.empty_like(alpha)
+        v_render = torch.empty_like(render)
+        v_alpha = torch.empty_like(alpha)
         is_learned = ctx.needs_input_grad[2]
         parts = 1
         if is_learned:

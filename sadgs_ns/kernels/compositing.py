@@ -29,7 +29,8 @@ from sadgs_ns.kernels.shared import load3, store3
 
 SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial
 _FAINTEST = tl.constexpr(0x3B808081)  # Bits of 1/255
-_GAUSSIANS, _BACKWARD_GAUSSIANS = 8, 16  # Gaussians of a batch. Forward, 16 take 1.2 times as long, 32 take 1.5 times
+_GAUSSIANS = 8  # Gaussians of a forward batch: 16 take 1.2 times as long, 32 take 1.5 times
+_BACKWARD_GAUSSIANS = 16  # Gaussians of a backward batch
 _WARPS = 1  # Warps of a program
 PRECISION = "tf32x3"
 """How Triton multiplies float32 on tensor cores: three products of the two parts of 11 bits of each factor. "tf32" is
@@ -98,16 +99,19 @@ def load_tile(tile, starts, num_pairs, height, width, tile_width, tile_height, T
         C · height · width; the tile's centre in px; and where its list of Gaussians starts and ends.
     """
     view = tile // (tile_height * tile_width)
-    tile_row, column = tile // tile_width % tile_height, tile % tile_width
+    tile_row = tile // tile_width % tile_height
+    column = tile % tile_width
     pixel = tl.arange(0, TILE * TILE)
-    x, y = pixel % TILE, pixel // TILE
+    x = pixel % TILE
+    y = pixel // TILE
     inside = (tile_row * TILE + y < height) & (column * TILE + x < width)
     at = (view * height + tile_row * TILE + y) * width + column * TILE + x
     start = tl.load(starts + tile)
     end = num_pairs
     if tile + 1 < tl.num_programs(0):
         end = tl.load(starts + tile + 1)
-    centre_x, centre_y = column.to(tl.float32) * TILE + TILE / 2, tile_row.to(tl.float32) * TILE + TILE / 2
+    centre_x = column.to(tl.float32) * TILE + TILE / 2
+    centre_y = tile_row.to(tl.float32) * TILE + TILE / 2
     return x, y, inside, at, centre_x, centre_y, start, end
 
 
@@ -148,13 +152,16 @@ def _composite_forward(
     x, y, inside, at, centre_x, centre_y, start, end = load_tile(
         tl.program_id(0), starts, num_pairs, height, width, tile_width, tile_height, TILE
     )  # fmt: skip
-    scaled_x, scaled_y = (x.to(tl.float32) - (TILE - 1) / 2) * SCALE, (y.to(tl.float32) - (TILE - 1) / 2) * SCALE
+    scaled_x = (x.to(tl.float32) - (TILE - 1) / 2) * SCALE
+    scaled_y = (y.to(tl.float32) - (TILE - 1) / 2) * SCALE
 
     # `passed` is what all Gaussians of the list so far let through. Where it falls to 1e-4 nothing more is drawn, not
     # even what made it fall, and `left` keeps what it was before.
     left = tl.where(inside, 1.0, 0.0)
     passed = left
-    red, green, blue = tl.zeros([PIXELS], tl.float32), tl.zeros([PIXELS], tl.float32), tl.zeros([PIXELS], tl.float32)
+    red = tl.zeros([PIXELS], tl.float32)
+    green = tl.zeros([PIXELS], tl.float32)
+    blue = tl.zeros([PIXELS], tl.float32)
     flaws = tl.zeros([PIXELS], tl.float32)
     last = tl.zeros([PIXELS], tl.int32)
     rows = tl.arange(0, GAUSSIANS)
@@ -209,7 +216,8 @@ def composite_forward(
     """
     views, tile_height, tile_width = isect_offsets.shape
     make = means2d.new_empty if len(flatten_ids) else means2d.new_zeros
-    renders, alphas = make((views, height, width, 3)), make((views, height, width, 1))
+    renders = make((views, height, width, 3))
+    alphas = make((views, height, width, 1))
     last_ids = make((views, height, width), dtype=flatten_ids.dtype)
     if len(flatten_ids):
         _composite_forward[(isect_offsets.numel(),)](
@@ -260,8 +268,10 @@ def _composite_backward(
     last = tl.load(last_ids + at, inside, -1)
     end = tl.minimum(end, tl.max(last) + 1)
     # Pixels are counted from the tile's centre: these offsets are small, and exact in 11 bits.
-    x, y = x.to(tl.float32) - (TILE - 1) / 2, y.to(tl.float32) - (TILE - 1) / 2
-    scaled_x, scaled_y = x * SCALE, y * SCALE
+    x = x.to(tl.float32) - (TILE - 1) / 2
+    y = y.to(tl.float32) - (TILE - 1) / 2
+    scaled_x = x * SCALE
+    scaled_y = y * SCALE
 
     red, green, blue = load3(v_renders, 3 * at, inside)
     v_alpha = red * 0
@@ -271,7 +281,9 @@ def _composite_backward(
     # 2^100 in the colours' sums and as 0 elsewhere; sums that large become NaN below, in the Gaussians that it sees.
     finite = tl.maximum(tl.maximum(tl.abs(red), tl.abs(green)), tl.maximum(tl.abs(blue), tl.abs(v_alpha))) < 1e18
     finite = finite & (red == red) & (green == green) & (blue == blue) & (v_alpha == v_alpha)
-    red, green, blue = tl.where(finite, red, 0.0), tl.where(finite, green, 0.0), tl.where(finite, blue, 0.0)
+    red = tl.where(finite, red, 0.0)
+    green = tl.where(finite, green, 0.0)
+    blue = tl.where(finite, blue, 0.0)
     transmittance = 1 - tl.load(drawn_alphas + at, inside, 0.0)
     # The colour behind the present Gaussian times the pixel's gradient; alpha counts as minus a background of one.
     behind = tl.where(finite, -v_alpha, 0.0) * transmittance
@@ -283,7 +295,8 @@ def _composite_backward(
     v_rgb = tl.load(v_renders + 3 * at[:, None] + k, inside[:, None] & (k < 3), 0.0)
     v_rgb = tl.where(finite[:, None] | (k >= 3), v_rgb, 1.2676506002282294e30)
     ones = tl.zeros([PIXELS // 2, 1], tl.float32) + 1
-    to_x, to_y = tl.where(k == 6, ones, 0.0), tl.where(k == 7, ones, 0.0)
+    to_x = tl.where(k == 6, ones, 0.0)
+    to_y = tl.where(k == 7, ones, 0.0)
 
     rows = tl.arange(0, GAUSSIANS)
     first_row = rows[:, None] == 0
@@ -400,7 +413,8 @@ class _RasterizeToPixels(torch.autograd.Function):
             v_renders.contiguous(), None if v_alphas is None else v_alphas.contiguous(), ctx.absgrad,
         )  # fmt: skip
         if ctx.absgrad:
-            means2d.absgrad, means2d.grad2d = v_absolute, v_means2d
+            means2d.absgrad = v_absolute
+            means2d.grad2d = v_means2d
         return v_means2d, v_conics, v_colors, v_opacities, *[None] * 5
 
 

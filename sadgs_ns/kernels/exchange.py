@@ -68,10 +68,12 @@ def pack(
 
 def unpack(rows: Tensor, top: int) -> tuple[Tensor, ...]:
     """Do what `distributed.exchange.unpack` does, for colours of three channels and contiguous rows."""
-    n, per_gaussian = len(rows), rows.shape[1] - 10
+    n = len(rows)
+    per_gaussian = rows.shape[1] - 10
     radii = rows.new_empty((1, n, 2) if per_gaussian == 2 else (1, n), dtype=torch.int32)
     means2d, conics, colors = (rows.new_empty((1, n, width)) for width in (2, 3, 3))
-    opacities, depths = rows.new_empty((1, n)), rows.new_empty((1, n))
+    opacities = rows.new_empty((1, n))
+    depths = rows.new_empty((1, n))
     if n:
         _unpack[cdiv(n, _ROWS),](
             rows, means2d, conics, opacities, colors, depths, radii, n, float(top), per_gaussian, _ROWS, _COLUMNS

@@ -18,7 +18,8 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, store3
 
 MAX_DEGREE = 3  # Highest degree that the kernels know
-_LANES, _BACKWARD_LANES = 128, 32  # Gaussians of one program, forward and backward, where each has four threads
+_LANES = 128  # Gaussians of one program forward
+_BACKWARD_LANES = 32  # Gaussians of one program backward, where each has four threads
 _VIEWS = 2  # Views whose gradients one launch sums in registers; more views take more launches
 
 
@@ -35,7 +36,9 @@ def _direction(means, viewmats, view, g, exists):
     """Unit vector from the camera to each Gaussian, and the inverse of their distance."""
     viewmat = viewmats + 16 * view
     x, y, z = load3(means, 3 * g, exists)
-    x, y, z = x + _minus_centre(viewmat, 0), y + _minus_centre(viewmat, 1), z + _minus_centre(viewmat, 2)
+    x = x + _minus_centre(viewmat, 0)
+    y = y + _minus_centre(viewmat, 1)
+    z = z + _minus_centre(viewmat, 2)
     inverse = 1 / tl.maximum(tl.sqrt(x * x + y * y + z * z), 1e-30)
     return x * inverse, y * inverse, z * inverse, inverse
 
@@ -43,7 +46,8 @@ def _direction(means, viewmats, view, g, exists):
 @triton.jit
 def _basis(x, y, z):
     """Harmonics 1 … 15 of a unit vector, as 3DGS orders and signs them."""
-    planar, mixed = x * x - y * y, 2 * x * y
+    planar = x * x - y * y
+    mixed = 2 * x * y
     ring = -2.285228997322329 * z * z + 0.4570457994644658
     return (
         -0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x,
@@ -59,7 +63,8 @@ def _basis(x, y, z):
 def _slopes(x, y, z):
     """Derivatives of the polynomials in `_basis` by x, by y and by z."""
     zero = x * 0
-    planar, mixed = x * x - y * y, 2 * x * y
+    planar = x * x - y * y
+    mixed = 2 * x * y
     ring = -2.285228997322329 * z * z + 0.4570457994644658
     by_x = (
         zero, zero, zero - 0.48860251190292,
@@ -95,12 +100,17 @@ def _forward(
     basis = _basis(x, y, z)
     others = rest + g.to(tl.int64) * stride  # in 32 bits, 45 g would overflow from 47.7 million Gaussians
     r, g_, b = load3(first, 3 * g, exists)
-    red, green, blue = 0.2820947917738781 * r + 0.5, 0.2820947917738781 * g_ + 0.5, 0.2820947917738781 * b + 0.5
+    red = 0.2820947917738781 * r + 0.5
+    green = 0.2820947917738781 * g_ + 0.5
+    blue = 0.2820947917738781 * b + 0.5
     for k in tl.static_range(15):
         r, g_, b = load3(others, 3 * k, exists & (k < used))
-        red, green, blue = red + basis[k] * r, green + basis[k] * g_, blue + basis[k] * b
+        red = red + basis[k] * r
+        green = green + basis[k] * g_
+        blue = blue + basis[k] * b
     # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
-    red, green = tl.maximum(red, 0.0, tl.PropagateNan.ALL), tl.maximum(green, 0.0, tl.PropagateNan.ALL)
+    red = tl.maximum(red, 0.0, tl.PropagateNan.ALL)
+    green = tl.maximum(green, 0.0, tl.PropagateNan.ALL)
     store3(colors, 3 * at, red, green, tl.maximum(blue, 0.0, tl.PropagateNan.ALL), g < n)
 
 
@@ -149,13 +159,20 @@ def _backward(
         sums = _add(sums, _basis(x, y, z), v)
         slope_x, slope_y, slope_z = _slopes(x, y, z)
         dx = tl.zeros([LANES], tl.float32)
-        dy, dz = dx, dx
+        dy = dx
+        dz = dx
         for k in tl.static_range(15):
             shade = tl.sum(v * tl.load(rest + at_others + 3 * k, seen & (k < used), 0.0), 1)
-            dx, dy, dz = dx + slope_x[k] * shade, dy + slope_y[k] * shade, dz + slope_z[k] * shade
+            dx = dx + slope_x[k] * shade
+            dy = dy + slope_y[k] * shade
+            dz = dz + slope_z[k] * shade
         along = dx * x + dy * y + dz * z
-        by_x, by_y, by_z = (dx - along * x) * inverse, (dy - along * y) * inverse, (dz - along * z) * inverse
-        v_x, v_y, v_z = v_x + by_x, v_y + by_y, v_z + by_z
+        by_x = (dx - along * x) * inverse
+        by_y = (dy - along * y) * inverse
+        by_z = (dz - along * z) * inverse
+        v_x = v_x + by_x
+        v_y = v_y + by_y
+        v_z = v_z + by_z
         if POSES:
             part = v_centres + 3 * (tl.cast(view, tl.int64) * tl.num_programs(0) + tl.program_id(0))
             store3(part, 0, tl.sum(by_x), tl.sum(by_y), tl.sum(by_z), start + i < num_views)
@@ -187,7 +204,8 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         means, rest, viewmats, radii, colors = ctx.saved_tensors
         num_views, n = radii.shape[:2]
-        v_means, v_first = torch.empty_like(means), torch.empty_like(means)
+        v_means = torch.empty_like(means)
+        v_first = torch.empty_like(means)
         # The kernel writes up to degree MAX_DEGREE; beyond that nothing depends on coefficients.
         written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
         v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)

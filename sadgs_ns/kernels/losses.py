@@ -19,7 +19,8 @@ from sadgs_ns.kernels.limits import check_pixels
 from sadgs_ns.kernels.shared import load3, store3
 
 _STRIP = 256  # Numbers along the rows that one program handles
-_RUN, _COLUMNS = 8, 128  # Rows and columns of numbers that one program handles
+_RUN = 8  # Rows of numbers that one program handles
+_COLUMNS = 128  # Columns of numbers that one program handles
 _LANES = 4096  # Partial sums that are added at once
 
 
@@ -42,12 +43,21 @@ def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.c
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     inside = i < n
     e_x = tl.zeros([STRIP], tl.float32)
-    e_y, e_xx, e_yy, e_xy = e_x, e_x, e_x, e_x
+    e_y = e_x
+    e_xx = e_x
+    e_yy = e_x
+    e_xy = e_x
     for k in tl.static_range(len(GAUSSIAN)):
         exists = i < n - 3 * k
-        a, b = tl.load(x + i + 3 * k, exists, 0.0), _target(y, i + 3 * k, exists)
-        wa, wb = GAUSSIAN[k] * a, GAUSSIAN[k] * b
-        e_x, e_y, e_xx, e_yy, e_xy = e_x + wa, e_y + wb, e_xx + wa * a, e_yy + wb * b, e_xy + wa * b
+        a = tl.load(x + i + 3 * k, exists, 0.0)
+        b = _target(y, i + 3 * k, exists)
+        wa = GAUSSIAN[k] * a
+        wb = GAUSSIAN[k] * b
+        e_x = e_x + wa
+        e_y = e_y + wb
+        e_xx = e_xx + wa * a
+        e_yy = e_yy + wb * b
+        e_xy = e_xy + wa * b
     size = tl.cast(n, tl.int64)
     store3(blurred, i, e_x, e_y, e_xx, inside, size)
     tl.store(blurred + 3 * size + i, e_yy, inside)
@@ -97,10 +107,15 @@ def _similarity(
     xx = _blur_along_columns(blurred + 2 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
     yy = _blur_along_columns(blurred + 3 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
     xy = _blur_along_columns(blurred + 4 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
-    c1, c2 = 0.01 * 0.01, 0.03 * 0.03
+    c1 = 0.01 * 0.01
+    c2 = 0.03 * 0.03
     similarity = tl.zeros([COLUMNS], tl.float32)
     for t in tl.static_range(RUN):
-        e_x, e_y, e_xx, e_yy, e_xy = x[t], y[t], xx[t], yy[t], xy[t]
+        e_x = x[t]
+        e_y = y[t]
+        e_xx = xx[t]
+        e_yy = yy[t]
+        e_xy = xy[t]
         valid = exists & (first + t < height - (len(GAUSSIAN) - 1))
         of_means = 1 / (e_x * e_x + e_y * e_y + c1)
         luminance = (2 * e_x * e_y + c1) * of_means
@@ -110,7 +125,9 @@ def _similarity(
         by_xy = 2 * luminance * of_variances
         by_x = 2 * (e_y - e_x * luminance) * of_means * structure - 2 * e_x * by_xx - e_y * by_xy
         inside = (c < row) & (first + t < height)
-        by_x, by_xx, by_xy = tl.where(valid, by_x, 0.0), tl.where(valid, by_xx, 0.0), tl.where(valid, by_xy, 0.0)
+        by_x = tl.where(valid, by_x, 0.0)
+        by_xx = tl.where(valid, by_xx, 0.0)
+        by_xy = tl.where(valid, by_xy, 0.0)
         store3(slopes, i + t * row, by_x, by_xx, by_xy, inside, size)
         similarity += tl.where(valid, luminance * structure, 0.0)
     program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
@@ -133,7 +150,8 @@ def _finish(
     ssim_lambda, l1_weight, ssim_weight, l2_weight, LANES: tl.constexpr,
 ):  # fmt: skip
     """Compute the loss and PSNR from the partial sums, in one program, and add the sum of `parts` to the loss."""
-    absolute, square = _total(differences, num_strips, LANES), _total(differences + num_strips, num_strips, LANES)
+    absolute = _total(differences, num_strips, LANES)
+    square = _total(differences + num_strips, num_strips, LANES)
     of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
     photometric = l1_weight * absolute + of_ssim + l2_weight * square
     tl.store(loss + tl.program_id(0), photometric + _total(parts, num_parts, LANES))
@@ -148,11 +166,14 @@ def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.cons
     i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
     size = tl.cast(n, tl.int64)
     by_x = tl.zeros([STRIP], tl.float32)
-    by_xx, by_xy = by_x, by_x
+    by_xx = by_x
+    by_xy = by_x
     for k in tl.static_range(len(GAUSSIAN)):
         exists = (i < n) & (i >= 3 * k)
         x, xx, xy = load3(slopes, i - 3 * k, exists, size)
-        by_x, by_xx, by_xy = by_x + GAUSSIAN[k] * x, by_xx + GAUSSIAN[k] * xx, by_xy + GAUSSIAN[k] * xy
+        by_x = by_x + GAUSSIAN[k] * x
+        by_xx = by_xx + GAUSSIAN[k] * xx
+        by_xy = by_xy + GAUSSIAN[k] * xy
     store3(spread, i, by_x, by_xx, by_xy, i < n, size)
 
 
@@ -168,13 +189,15 @@ def _gradient(
     i = (tl.program_id(2) * height + first) * row + c
     size = tl.cast(n, tl.int64)
     above = tl.constexpr(len(GAUSSIAN) - 1)
-    begin, end = above - first, height - first
+    begin = above - first
+    end = height - first
     by_x = _blur_along_columns(spread, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     by_xx = _blur_along_columns(spread + size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     by_xy = _blur_along_columns(spread + 2 * size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
     for t in tl.static_range(RUN):
         inside = exists & (first + t < height)
-        a, b = tl.load(x + i + t * row, inside, 0.0), _target(y, i + t * row, inside)
+        a = tl.load(x + i + t * row, inside, 0.0)
+        b = _target(y, i + t * row, inside)
         sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
         of_ssim = by_x[t] + 2 * a * by_xx[t] + b * by_xy[t]
         total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
@@ -188,18 +211,23 @@ class _PhotometricLoss(torch.autograd.Function):
         parts: Tensor | None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         views, height, width, _ = x.shape
-        n, row = x.numel(), 3 * width
-        blurred, slopes = x.new_empty((5, n)), x.new_empty((3, n))
+        n = x.numel()
+        row = 3 * width
+        blurred = x.new_empty((5, n))
+        slopes = x.new_empty((3, n))
         strips = cdiv(n, _STRIP)
         tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
-        differences, similarities = x.new_empty((2, strips)), x.new_empty(math.prod(tiles))
+        differences = x.new_empty((2, strips))
+        similarities = x.new_empty(math.prod(tiles))
         _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
         _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
-        ctx.window, ctx.num_parts = window, 0 if parts is None else len(parts)
+        ctx.window = window
+        ctx.num_parts = 0 if parts is None else len(parts)
         n_valid = 3 * views * (height - len(window) + 1) * (width - len(window) + 1)
         ctx.weights = (1 - ssim_lambda) / n, ssim_lambda / n_valid, l2_lambda / n
-        loss, psnr = x.new_empty(()), x.new_empty(())
+        loss = x.new_empty(())
+        psnr = x.new_empty(())
         _finish[1,](
             differences, similarities, differences if parts is None else parts, loss, psnr,
             n, strips, similarities.numel(), ctx.num_parts, ssim_lambda, *ctx.weights, _LANES, num_warps=8,
@@ -213,8 +241,10 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         x, y, slopes = ctx.saved_tensors
         views, height, width, _ = x.shape
-        n, row = x.numel(), 3 * width
-        spread, gradient = torch.empty_like(slopes), torch.empty_like(x)
+        n = x.numel()
+        row = 3 * width
+        spread = torch.empty_like(slopes)
+        gradient = torch.empty_like(x)
         tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
         _spread_along_rows[cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
         _gradient[tiles](x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS)

@@ -63,7 +63,9 @@ def _correct_poses(initial, table, view_ids, viewmats, n, LANES: tl.constexpr):
         middle = r10 * first + r11 * second + r12 * third
         bottom = r20 * first + r21 * second + r22 * third
         if j == 3:
-            top, middle, bottom = top + shift_0, middle + shift_1, bottom + shift_2
+            top = top + shift_0
+            middle = middle + shift_1
+            bottom = bottom + shift_2
         store3(viewmats, at + j, top, middle, bottom, exists, 4)
         tl.store(viewmats + at + 12 + j, tl.load(initial + at + 12 + j, exists), exists)
 
@@ -76,7 +78,9 @@ def _correct_poses_backward(initial, table, view_ids, v_viewmats, v_rows, n, LAN
     x, y, z = load3(table, 6 * tl.load(view_ids + view, exists, 0), exists)
     at = 16 * view
     zero = tl.zeros([LANES], tl.float32)
-    g00, g01, g02, g10, g11, g12, g20, g21, g22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    g00, g01, g02 = zero, zero, zero
+    g10, g11, g12 = zero, zero, zero
+    g20, g21, g22 = zero, zero, zero
     for j in tl.static_range(4):  # The gradient by the rotation: that of the matrix times the initial one, transposed.
         first, second, third = load3(initial, at + j, exists, 4)
         v_0, v_1, v_2 = load3(v_viewmats, at + j, exists, 4)
@@ -88,8 +92,11 @@ def _correct_poses_backward(initial, table, view_ids, v_viewmats, v_rows, n, LAN
     squared = x * x + y * y + z * z
     sine, sine_slope = _series(squared, 2, _TERMS)
     versine, versine_slope = _series(squared, 3, _TERMS)
-    versine, versine_slope = 0.5 * versine, 0.5 * versine_slope
-    axis_x, axis_y, axis_z = g21 - g12, g02 - g20, g10 - g01
+    versine = 0.5 * versine
+    versine_slope = 0.5 * versine_slope
+    axis_x = g21 - g12
+    axis_y = g02 - g20
+    axis_z = g10 - g01
     trace = g00 + g11 + g22
     along_x = 2 * g00 * x + (g01 + g10) * y + (g02 + g20) * z  # (G + Gᵀ) ω
     along_y = (g01 + g10) * x + 2 * g11 * y + (g12 + g21) * z

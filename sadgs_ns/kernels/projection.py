@@ -75,18 +75,43 @@ def _project_backward(
     m00, m01, m02 = r00 * sx, r01 * sy, r02 * sz  # M = R S, and Σ = M Mᵀ
     m10, m11, m12 = r10 * sx, r11 * sy, r12 * sz
     m20, m21, m22 = r20 * sx, r21 * sy, r22 * sz
-    xx, xy, xz = m00 * m00 + m01 * m01 + m02 * m02, m00 * m10 + m01 * m11 + m02 * m12, m00 * m20 + m01 * m21 + m02 * m22
-    yy, yz, zz = m10 * m10 + m11 * m11 + m12 * m12, m10 * m20 + m11 * m21 + m12 * m22, m20 * m20 + m21 * m21 + m22 * m22
+    xx = m00 * m00 + m01 * m01 + m02 * m02
+    xy = m00 * m10 + m01 * m11 + m02 * m12
+    xz = m00 * m20 + m01 * m21 + m02 * m22
+    yy = m10 * m10 + m11 * m11 + m12 * m12
+    yz = m10 * m20 + m11 * m21 + m12 * m22
+    zz = m20 * m20 + m21 * m21 + m22 * m22
     v_x = tl.zeros([LANES], tl.float32)
-    v_y, v_z, v_xx, v_xy, v_xz, v_yy, v_yz, v_zz, count = v_x, v_x, v_x, v_x, v_x, v_x, v_x, v_x, v_x
+    v_y = v_x
+    v_z = v_x
+    v_xx = v_x
+    v_xy = v_x
+    v_xz = v_x
+    v_yy = v_x
+    v_yz = v_x
+    v_zz = v_x
+    count = v_x
     for i in range(num_views):
         at = i * tl.cast(n, tl.int64) + g
         seen = drawn(radii, at, exists, PER_GAUSSIAN)
-        viewmat, K = viewmats + 16 * i, Ks + 9 * i
-        w00, w01, w02, t0 = tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2), tl.load(viewmat + 3)
-        w10, w11, w12, t1 = tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6), tl.load(viewmat + 7)
-        w20, w21, w22, t2 = tl.load(viewmat + 8), tl.load(viewmat + 9), tl.load(viewmat + 10), tl.load(viewmat + 11)
-        fx, cx, fy, cy = tl.load(K), tl.load(K + 2), tl.load(K + 4), tl.load(K + 5)
+        viewmat = viewmats + 16 * i
+        K = Ks + 9 * i
+        w00 = tl.load(viewmat)
+        w01 = tl.load(viewmat + 1)
+        w02 = tl.load(viewmat + 2)
+        t0 = tl.load(viewmat + 3)
+        w10 = tl.load(viewmat + 4)
+        w11 = tl.load(viewmat + 5)
+        w12 = tl.load(viewmat + 6)
+        t1 = tl.load(viewmat + 7)
+        w20 = tl.load(viewmat + 8)
+        w21 = tl.load(viewmat + 9)
+        w22 = tl.load(viewmat + 10)
+        t2 = tl.load(viewmat + 11)
+        fx = tl.load(K)
+        cx = tl.load(K + 2)
+        fy = tl.load(K + 4)
+        cy = tl.load(K + 5)
         x = w00 * mean_x + w01 * mean_y + w02 * mean_z + t0
         y = w10 * mean_x + w11 * mean_y + w12 * mean_z + t1
         z = tl.where(seen, w20 * mean_x + w21 * mean_y + w22 * mean_z + t2, 1.0)
@@ -96,14 +121,23 @@ def _project_backward(
         a, b, c = load3(conics, 3 * at, seen)
         h_a, h_b, h_c = load3(v_conics, at * row_conic, seen)
         h_b = 0.5 * h_b
-        top, right, left, bottom = a * h_a + b * h_b, a * h_b + b * h_c, b * h_a + c * h_b, b * h_b + c * h_c
+        top = a * h_a + b * h_b
+        right = a * h_b + b * h_c
+        left = b * h_a + c * h_b
+        bottom = b * h_b + c * h_c
         h00, h01, h11 = -(top * a + right * b), -(top * b + right * c), -(left * b + bottom * c)
 
         # Σ2D = T Σ Tᵀ with T = J W, where W is the camera's rotation and J the Jacobian [2, 3] of the projection.
-        slope_x, slope_y = clamped(x * inverse, fx, cx, width), clamped(y * inverse, fy, cy, height)
-        jx, jy = fx * inverse, fy * inverse
-        t00, t01, t02 = jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22)
-        t10, t11, t12 = jy * (w10 - slope_y * w20), jy * (w11 - slope_y * w21), jy * (w12 - slope_y * w22)
+        slope_x = clamped(x * inverse, fx, cx, width)
+        slope_y = clamped(y * inverse, fy, cy, height)
+        jx = fx * inverse
+        jy = fy * inverse
+        t00 = jx * (w00 - slope_x * w20)
+        t01 = jx * (w01 - slope_x * w21)
+        t02 = jx * (w02 - slope_x * w22)
+        t10 = jy * (w10 - slope_y * w20)
+        t11 = jy * (w11 - slope_y * w21)
+        t12 = jy * (w12 - slope_y * w22)
         k00, k01, k02 = h00 * t00 + h01 * t10, h00 * t01 + h01 * t11, h00 * t02 + h01 * t12  # H T
         k10, k11, k12 = h01 * t00 + h11 * t10, h01 * t01 + h11 * t11, h01 * t02 + h11 * t12
         v_xx += tl.where(seen, t00 * k00 + t10 * k10, 0.0)
@@ -125,8 +159,10 @@ def _project_backward(
             2 * (u10 * w10 + u11 * w11 + u12 * w12), 2 * (u10 * w20 + u11 * w21 + u12 * w22),
         )  # fmt: skip
         at_row = at * row2d
-        v_u, v_v = jx * tl.load(v_means2d + at_row, seen, 0.0), jy * tl.load(v_means2d + at_row + 1, seen, 0.0)
-        by_x, by_y = by_x + v_u, by_y + v_v
+        v_u = jx * tl.load(v_means2d + at_row, seen, 0.0)
+        v_v = jy * tl.load(v_means2d + at_row + 1, seen, 0.0)
+        by_x = by_x + v_u
+        by_y = by_y + v_v
         by_z = by_z_of_x + by_z_of_y - (x * v_u + y * v_v) * inverse
         if DEPTHS:
             by_z += tl.load(v_depths + at, seen, 0.0)
@@ -136,17 +172,22 @@ def _project_backward(
         count += seen
         if POSES:
             # The rotation turns the centre, and W of T = J W has the gradient Jᵀ 2 H T Σ.
-            row_x, row_y = 2 * jx, 2 * jy
-            back_x, back_y = row_x * slope_x, row_y * slope_y
+            row_x = 2 * jx
+            row_y = 2 * jy
+            back_x = row_x * slope_x
+            back_y = row_y * slope_y
             part = v_poses + 12 * (i * tl.cast(tl.num_programs(0), tl.int64) + tl.program_id(0))
             _store_row(part, seen, by_x, mean_x, mean_y, mean_z, row_x * u00, row_x * u01, row_x * u02)
             _store_row(part + 4, seen, by_y, mean_x, mean_y, mean_z, row_y * u10, row_y * u11, row_y * u12)
-            last_0, last_1 = -back_x * u00 - back_y * u10, -back_x * u01 - back_y * u11
+            last_0 = -back_x * u00 - back_y * u10
+            last_1 = -back_x * u01 - back_y * u11
             _store_row(part + 8, seen, by_z, mean_x, mean_y, mean_z, last_0, last_1, -back_x * u02 - back_y * u12)
 
     if PASSED:
         x, y, z = load3(v_passed, 3 * g, exists)
-        v_x, v_y, v_z = v_x + x, v_y + y, v_z + z
+        v_x = v_x + x
+        v_y = v_y + y
+        v_z = v_z + z
     store3(v_means, 3 * g, v_x, v_y, v_z, exists)
     seen = count > 0  # What no view drew has gradients of 0, whatever its numbers are.
     # v_M = 2 v_Σ M, of which R's gradient is v_M S.
@@ -157,8 +198,16 @@ def _project_backward(
     v_sy = tl.where(seen, 2 * (r01 * n01 + r11 * n11 + r21 * n21), 0.0)
     v_sz = tl.where(seen, 2 * (r02 * n02 + r12 * n12 + r22 * n22), 0.0)
     store3(v_scales, 3 * g, v_sx, v_sy, v_sz, exists)
-    sx, sy, sz = 4 * sx, 4 * sy, 4 * sz  # both factors 2: of v_M and of the rotation's derivatives
-    n00, n10, n20, n01, n11, n21 = n00 * sx, n10 * sx, n20 * sx, n01 * sy, n11 * sy, n21 * sy
+    # Both factors 2: of v_M and of the rotation's derivatives.
+    sx = 4 * sx
+    sy = 4 * sy
+    sz = 4 * sz
+    n00 = n00 * sx
+    n10 = n10 * sx
+    n20 = n20 * sx
+    n01 = n01 * sy
+    n11 = n11 * sy
+    n21 = n21 * sy
     n02, n12, n22 = n02 * sz, n12 * sz, n22 * sz
     v_qw = qx * (n21 - n12) + qy * (n02 - n20) + qz * (n10 - n01)
     v_qx = qy * (n10 + n01) + qz * (n20 + n02) + qw * (n21 - n12) - 2 * qx * (n11 + n22)
@@ -194,7 +243,9 @@ class _Project(torch.autograd.Function):
         v_passed: Tensor | None,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
         means, quats, scales, viewmats, Ks, radii, means2d, conics = ctx.saved_tensors
-        v_means, v_quats, v_scales = torch.empty_like(means), torch.empty_like(quats), torch.empty_like(scales)
+        v_means = torch.empty_like(means)
+        v_quats = torch.empty_like(quats)
+        v_scales = torch.empty_like(scales)
         v_means2d, row2d = equally_spaced_rows(v_means2d, means2d)
         v_conics, row_conic = equally_spaced_rows(v_conics, conics)
         # The kernel reads no tensor that stands in for one that is None.

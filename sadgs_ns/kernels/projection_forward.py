@@ -69,26 +69,49 @@ def _project_forward(
 
     for i in range(num_views):
         at = i * tl.cast(n, tl.int64) + g
-        viewmat, K = viewmats + 16 * i, Ks + 9 * i
-        w00, w01, w02, t0 = tl.load(viewmat), tl.load(viewmat + 1), tl.load(viewmat + 2), tl.load(viewmat + 3)
-        w10, w11, w12, t1 = tl.load(viewmat + 4), tl.load(viewmat + 5), tl.load(viewmat + 6), tl.load(viewmat + 7)
-        w20, w21, w22, t2 = tl.load(viewmat + 8), tl.load(viewmat + 9), tl.load(viewmat + 10), tl.load(viewmat + 11)
-        fx, cx, fy, cy = tl.load(K), tl.load(K + 2), tl.load(K + 4), tl.load(K + 5)
+        viewmat = viewmats + 16 * i
+        K = Ks + 9 * i
+        w00 = tl.load(viewmat)
+        w01 = tl.load(viewmat + 1)
+        w02 = tl.load(viewmat + 2)
+        t0 = tl.load(viewmat + 3)
+        w10 = tl.load(viewmat + 4)
+        w11 = tl.load(viewmat + 5)
+        w12 = tl.load(viewmat + 6)
+        t1 = tl.load(viewmat + 7)
+        w20 = tl.load(viewmat + 8)
+        w21 = tl.load(viewmat + 9)
+        w22 = tl.load(viewmat + 10)
+        t2 = tl.load(viewmat + 11)
+        fx = tl.load(K)
+        cx = tl.load(K + 2)
+        fy = tl.load(K + 4)
+        cy = tl.load(K + 5)
         depth = _dot(w20, w21, w22, mean_x, mean_y, mean_z) + t2
         drawn = visible & (depth >= near_plane) & (depth <= FAR)
         inverse = 1 / tl.where(drawn, depth, 1.0)
         ratio_x = (_dot(w00, w01, w02, mean_x, mean_y, mean_z) + t0) * inverse
         ratio_y = (_dot(w10, w11, w12, mean_x, mean_y, mean_z) + t1) * inverse
-        u, v = fx * ratio_x + cx, fy * ratio_y + cy
+        u = fx * ratio_x + cx
+        v = fy * ratio_y + cy
 
         # The rows of J W, and of P = J W R S.
-        slope_x, slope_y = clamped(ratio_x, fx, cx, width), clamped(ratio_y, fy, cy, height)
-        jx, jy = fx * inverse, fy * inverse
-        x0, x1, x2 = jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22)
-        y0, y1, y2 = jy * (w10 - slope_y * w20), jy * (w11 - slope_y * w21), jy * (w12 - slope_y * w22)
-        p00, p10 = s0 * _dot(x0, x1, x2, r00, r10, r20), s0 * _dot(y0, y1, y2, r00, r10, r20)
-        p01, p11 = s1 * _dot(x0, x1, x2, r01, r11, r21), s1 * _dot(y0, y1, y2, r01, r11, r21)
-        p02, p12 = s2 * _dot(x0, x1, x2, r02, r12, r22), s2 * _dot(y0, y1, y2, r02, r12, r22)
+        slope_x = clamped(ratio_x, fx, cx, width)
+        slope_y = clamped(ratio_y, fy, cy, height)
+        jx = fx * inverse
+        jy = fy * inverse
+        x0 = jx * (w00 - slope_x * w20)
+        x1 = jx * (w01 - slope_x * w21)
+        x2 = jx * (w02 - slope_x * w22)
+        y0 = jy * (w10 - slope_y * w20)
+        y1 = jy * (w11 - slope_y * w21)
+        y2 = jy * (w12 - slope_y * w22)
+        p00 = s0 * _dot(x0, x1, x2, r00, r10, r20)
+        p10 = s0 * _dot(y0, y1, y2, r00, r10, r20)
+        p01 = s1 * _dot(x0, x1, x2, r01, r11, r21)
+        p11 = s1 * _dot(y0, y1, y2, r01, r11, r21)
+        p02 = s2 * _dot(x0, x1, x2, r02, r12, r22)
+        p12 = s2 * _dot(y0, y1, y2, r02, r12, r22)
         a = p00 * p00 + p01 * p01 + p02 * p02
         b = p00 * p10 + p01 * p11 + p02 * p12
         c = p10 * p10 + p11 * p11 + p12 * p12
@@ -110,7 +133,8 @@ def _project_forward(
         c += BLUR
 
         if PER_GAUSSIAN == 2:
-            radius_x, radius_y = tl.ceil(extent * tl.sqrt(a)), tl.ceil(extent * tl.sqrt(c))
+            radius_x = tl.ceil(extent * tl.sqrt(a))
+            radius_y = tl.ceil(extent * tl.sqrt(c))
         else:
             half = 0.5 * (a - c)
             longest = 0.5 * (a + c) + tl.sqrt(tl.maximum(half * half + b * b, 0.01))

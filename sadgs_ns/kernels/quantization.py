@@ -29,12 +29,15 @@ def _quantize(
     xx, xy, yy = load3(tensor, 3 * pixel, exists)
     # NaN is told by comparison, for Triton's maximum drops it on a GPU, and no integer is made of it.
     known = (xx == xx) & (xy == xy) & (yy == yy)
-    xx, xy, yy = tl.where(known, xx, 0.0), tl.where(known, xy, 0.0), tl.where(known, yy, 0.0)
+    xx = tl.where(known, xx, 0.0)
+    xy = tl.where(known, xy, 0.0)
+    yy = tl.where(known, yy, 0.0)
     product = tl.sqrt(tl.maximum(xx, 0.0)) * tl.sqrt(tl.maximum(yy, 0.0))
     correlation = tl.where(product > 0, xy / tl.maximum(product, TINY), 0.0)
     correlation = 127.5 + 127 * tl.minimum(tl.maximum(correlation, -1.0), 1.0)
     correlation = tl.where(known, correlation, INVALID)
-    x, y = _to_byte(xx, HIGHEST, OCTAVES), _to_byte(yy, HIGHEST, OCTAVES)
+    x = _to_byte(xx, HIGHEST, OCTAVES)
+    y = _to_byte(yy, HIGHEST, OCTAVES)
     store3(quantized, 3 * pixel, x.to(tl.uint8), correlation.to(tl.uint8), y.to(tl.uint8), exists)
 
 

@@ -15,7 +15,8 @@ _LANES = 256  # Gaussians that one program handles
 @triton.jit
 def _norm(gradient, at, seen, scale_x, scale_y):
     """Length of a gradient [LANES], 0 where it is NaN."""
-    x, y = scale_x * tl.load(gradient + at, seen, 0.0), scale_y * tl.load(gradient + at + 1, seen, 0.0)
+    x = scale_x * tl.load(gradient + at, seen, 0.0)
+    y = scale_y * tl.load(gradient + at + 1, seen, 0.0)
     length = tl.sqrt(x * x + y * y)
     return tl.where(length == length, length, 0.0)
 
@@ -29,7 +30,8 @@ def _accumulate_gradients(
     """Add one backward pass; rows of the gradients lie `row` numbers apart, and views `view` numbers."""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     total = tl.zeros([LANES], tl.float32)
-    absolute_total, count = total, total
+    absolute_total = total
+    count = total
     for i in range(num_views):
         seen = drawn(radii, i * tl.cast(n, tl.int64) + g, g < n, PER_GAUSSIAN)
         total += _norm(gradient, i * tl.cast(view, tl.int64) + g * row, seen, scale_x, scale_y)

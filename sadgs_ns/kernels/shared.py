@@ -69,5 +69,6 @@ def equally_spaced_rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, 
         gradient = torch.zeros_like(like)
     row = gradient.stride(1)
     if gradient.stride() != (gradient.shape[1] * row, row, 1):
-        gradient, row = gradient.contiguous(), gradient.shape[2]
+        gradient = gradient.contiguous()
+        row = gradient.shape[2]
     return gradient, row

@@ -15,7 +15,8 @@ _LANES = 128  # Gaussians that one program handles
 @triton.jit
 def _hypot(a, b):
     """√(a² + b²) without overflow."""
-    a, b = tl.abs(a), tl.abs(b)
+    a = tl.abs(a)
+    b = tl.abs(b)
     large = tl.maximum(tl.maximum(a, b), 1e-37)
     small = tl.minimum(a, b) / large
     return large * tl.sqrt(1 + small * small)
@@ -32,7 +33,8 @@ def _matrix_row(matrix, row, x, y, z):
 def _screen_axis(viewmat, x, y, z, scale, jacobian):
     """J W times one axis of the Gaussian: x and y in px."""
     jxx, jxz, jyy, jyz = jacobian
-    to_right, down = _matrix_row(viewmat, 0, x, y, z), _matrix_row(viewmat, 1, x, y, z)
+    to_right = _matrix_row(viewmat, 0, x, y, z)
+    down = _matrix_row(viewmat, 1, x, y, z)
     forward = _matrix_row(viewmat, 2, x, y, z)
     return (jxx * to_right + jxz * forward) * scale, (jyy * down + jyz * forward) * scale
 
@@ -70,7 +72,10 @@ def _observe(
     qw = tl.load(quats + 4 * g, candidate, 1.0)
     qx, qy, qz = load3(quats, 4 * g + 1, candidate)
     norm = 1 / tl.maximum(tl.sqrt(qw * qw + qx * qx + qy * qy + qz * qz), 1e-12)
-    qw, qx, qy, qz = qw * norm, qx * norm, qy * norm, qz * norm
+    qw = qw * norm
+    qx = qx * norm
+    qy = qy * norm
+    qz = qz * norm
     for view in range(num_views):
         at = view * tl.cast(n, tl.int64) + g
         seen = drawn(radii, at, candidate, PER_GAUSSIAN)
@@ -90,7 +95,8 @@ def _observe(
         factor_yy = tl.sqrt(tl.maximum(yy * yy - factor_xy * factor_xy, 0.0))
         radius = 2 * tl.sqrt(tl.load(jitter + 2 * at, seen, 0.0))
         angle = 6.283185307179586 * tl.load(jitter + 2 * at + 1, seen, 0.0)
-        u, v = radius * tl.cos(angle), radius * tl.sin(angle)
+        u = radius * tl.cos(angle)
+        v = radius * tl.sin(angle)
         point_x = tl.load(means2d + 2 * at, seen, -1.0) + (factor_xx * u).to(tl.float32)
         point_y = tl.load(means2d + 2 * at + 1, seen, -1.0) + (factor_xy * u + factor_yy * v).to(tl.float32)
         observed = seen & (point_x >= 0) & (point_x < width) & (point_y >= 0) & (point_y < height)
@@ -102,21 +108,29 @@ def _observe(
         s_yy = tl.load(pixel + 2, observed, 0).to(tl.float32)
         if structure_tensors.dtype.element_ty == tl.uint8:
             observed = observed & (s_xy != INVALID)
-            frequency_x, frequency_y = _frequency(s_xx, HIGHEST, OCTAVES), _frequency(s_yy, HIGHEST, OCTAVES)
+            frequency_x = _frequency(s_xx, HIGHEST, OCTAVES)
+            frequency_y = _frequency(s_yy, HIGHEST, OCTAVES)
             s_xy = frequency_x * frequency_y * (s_xy - 127) / 127
-            s_xx, s_yy = frequency_x * frequency_x, frequency_y * frequency_y
+            s_xx = frequency_x * frequency_x
+            s_yy = frequency_y * frequency_y
         observed = observed & (tl.abs(s_xx) + tl.abs(s_xy) + tl.abs(s_yy) < float("inf"))
         # The Jacobian of gsplat's forward pass, with its clamp near the frustum's border.
-        viewmat, K = viewmats + 16 * view, Ks + 9 * view
+        viewmat = viewmats + 16 * view
+        K = Ks + 9 * view
         depth = _matrix_row(viewmat, 2, x, y, z) + tl.load(viewmat + 11)
         depth = tl.where(seen, depth, 1.0)
-        fx, fy, cx, cy = tl.load(K), tl.load(K + 4), tl.load(K + 2), tl.load(K + 5)
+        fx = tl.load(K)
+        fy = tl.load(K + 4)
+        cx = tl.load(K + 2)
+        cy = tl.load(K + 5)
         tangent_x = (_matrix_row(viewmat, 0, x, y, z) + tl.load(viewmat + 3)) / depth
         tangent_y = (_matrix_row(viewmat, 1, x, y, z) + tl.load(viewmat + 7)) / depth
-        margin_x, margin_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+        margin_x = MARGIN * 0.5 * width / fx
+        margin_y = MARGIN * 0.5 * height / fy
         tangent_x = tl.maximum(tl.minimum(tangent_x, (width - cx) / fx + margin_x), -cx / fx - margin_x)
         tangent_y = tl.maximum(tl.minimum(tangent_y, (height - cy) / fy + margin_y), -cy / fy - margin_y)
-        jxx, jyy = fx / depth, fy / depth
+        jxx = fx / depth
+        jyy = fy / depth
         jacobian = jxx, -jxx * tangent_x, jyy, -jyy * tangent_y
         r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation(qw, qx, qy, qz)
         tensor = s_xx, s_xy, s_yy
@@ -124,7 +138,8 @@ def _observe(
         eta1 = _eta(_screen_axis(viewmat, r01, r11, r21, scale1, jacobian), tensor, EPSILON)
         eta2 = _eta(_screen_axis(viewmat, r02, r12, r22, scale2, jacobian), tensor, EPSILON)
         observed = observed & (eta0 < float("inf")) & (eta1 < float("inf")) & (eta2 < float("inf"))
-        eta0, eta1 = tl.where(observed, eta0, float("nan")), tl.where(observed, eta1, float("nan"))
+        eta0 = tl.where(observed, eta0, float("nan"))
+        eta1 = tl.where(observed, eta1, float("nan"))
         store3(eta, 3 * at, eta0, eta1, tl.where(observed, eta2, float("nan")), candidate)
 
 

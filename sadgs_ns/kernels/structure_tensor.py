@@ -52,14 +52,19 @@ def _differentiate(
     slope_x = tl.load(total_x + of_weight, exists, 0.0)
     slope_y = tl.load(total_y + of_weight, exists, 0.0)
     xx = tl.zeros([PIXELS], tl.float32)
-    xy, yy, band = xx, xx, xx
+    xy = xx
+    yy = xx
+    band = xx
     for channel in range(channels):
         at = (image * channels + channel) * n + pixel
         smoothed = tl.load(blurred + at, exists, 0.0) / totals
         x = (tl.load(blurred_x + at, exists, 0.0) - smoothed * slope_x) / totals
         y = (tl.load(blurred_y + at, exists, 0.0) - smoothed * slope_y) / totals
         difference = tl.load(previous + at, exists, 0.0) - smoothed
-        xx, xy, yy, band = xx + x * x, xy + x * y, yy + y * y, band + difference * difference
+        xx = xx + x * x
+        xy = xy + x * y
+        yy = yy + y * y
+        band = band + difference * difference
         tl.store(blurred + at, smoothed, exists)
     store3(products, 3 * image * n + pixel, xx * within, xy * within, yy * within, exists, n)
     tl.store(energy + image * n + pixel, band * within, exists)
@@ -77,7 +82,9 @@ def _aggregate(
     totals = tl.load(total + of_weight, exists, 1.0)
     at = 3 * image * n + pixel
     xx, xy, yy = load3(products, at, exists, n)
-    xx, xy, yy = xx / totals, xy / totals, yy / totals
+    xx = xx / totals
+    xy = xy / totals
+    yy = yy / totals
     band = tl.load(energy + image * n + pixel, exists, 0.0)
     band = band / tl.load(total_of_energy + of_weight, exists, 1.0)
     weight = tl.where(band > 0, tl.exp(exponent * tl.log(tl.maximum(band, TINY))), 0.0)

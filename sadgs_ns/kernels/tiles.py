@@ -19,10 +19,13 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
 
 _LANES = 32  # Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others
-_FEW_PAIRS, _PART_PAIRS = 64, 256
-"""Largest number of tiles of a Gaussian that one lane lists, and mean number of tiles of the parts into which a larger
-one is cut. One that reaches all tiles of an image would take a lane, or a program, longer than the rest of a step."""
-_PART_ROWS, _PART_COLUMNS = 4, 8  # Rows and columns of tiles that a program writes at once, of a part
+_FEW_PAIRS = 64
+"""Largest number of tiles of a Gaussian that one lane lists. A larger Gaussian is cut into parts."""
+_PART_PAIRS = 256
+"""Mean number of tiles of a part. A Gaussian that reaches all tiles of an image would take a lane, or a program, longer
+than the rest of a step."""
+_PART_ROWS = 4  # Rows of tiles of a part that a program writes at once
+_PART_COLUMNS = 8  # Columns of tiles of a part that a program writes at once
 _PROGRAMS = 4096  # Most programs that share out the parts: as many as an H100 runs at once, of one warp each
 _PLACE = tl.constexpr(2**24)  # Factor on a Gaussian's place by depth, noted with the number of one of its parts
 _ORDER_LANES = 512  # Pairs or tiles that one program handles where the lists are put in order
@@ -46,16 +49,20 @@ def _load_ellipse(
         ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
     opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
     drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves what it culls unwritten
-    x, y = tl.load(means2d + 2 * g, drawn, 0.0), tl.load(means2d + 2 * g + 1, drawn, 0.0)
+    x = tl.load(means2d + 2 * g, drawn, 0.0)
+    y = tl.load(means2d + 2 * g + 1, drawn, 0.0)
     drawn = drawn & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
-    x, y = tl.where(drawn, x, 0.0), tl.where(drawn, y, 0.0)
+    x = tl.where(drawn, x, 0.0)
+    y = tl.where(drawn, y, 0.0)
     a = tl.load(conics + 3 * g, drawn, 1.0)
     b = tl.load(conics + 3 * g + 1, drawn, 0.0)
     c = tl.load(conics + 3 * g + 2, drawn, 1.0)
     # The determinant of a thin conic cancels in float32, as does gsplat's exponent: its rounding raises the level.
     determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
     proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's is listed
-    a, b, c = tl.where(proper, a, 1.0), tl.where(proper, b, 0.0), tl.where(proper, c, 1.0)
+    a = tl.where(proper, a, 1.0)
+    b = tl.where(proper, b, 0.0)
+    c = tl.where(proper, c, 1.0)
     determinant = tl.where(proper, determinant, 1.0)
     level = 2 * tl.log(tl.where(drawn, opacity, 1.0)) * (1 + 1e-6 * a * c / determinant) + 1e-4
     proper = proper & (level < 1e30)
@@ -82,7 +89,8 @@ def _columns_of_row(row, ellipse, TILE: tl.constexpr):
     right = (-b * rightmost + tl.sqrt(tl.maximum(a * level - determinant * rightmost * rightmost, 0.0))) / a + 0.01
     left = (-b * leftmost - tl.sqrt(tl.maximum(a * level - determinant * leftmost * leftmost, 0.0))) / a - 0.01
     # Both sides are clipped, so that an ellipse of billions of px does not overflow integers.
-    low, high = first_column.to(tl.float32), last_column.to(tl.float32)
+    low = first_column.to(tl.float32)
+    high = last_column.to(tl.float32)
     first = tl.minimum(tl.maximum(tl.ceil((x + left + 0.5) / TILE) - 1, low), high)
     last = tl.minimum(tl.maximum(tl.floor((x + right - 0.5) / TILE) + 1, low), high)
     return tl.where(proper, first, first_column).to(tl.int32), tl.where(proper, last, last_column).to(tl.int32)
@@ -100,7 +108,8 @@ def _count(
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = g < n
     if CULL:
-        x, y = tl.load(means2d + 2 * g, exists, 0.0), tl.load(means2d + 2 * g + 1, exists, 0.0)
+        x = tl.load(means2d + 2 * g, exists, 0.0)
+        y = tl.load(means2d + 2 * g + 1, exists, 0.0)
         near = (tl.abs(x - half_width) < reach_x) & (tl.abs(y - half_height) < reach_y)
         for i in tl.static_range(PER_GAUSSIAN):
             tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & ~near)
@@ -178,7 +187,8 @@ def _list_parts(
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Write the pairs of the parts that `_list` noted. A part is a share of the rows of a Gaussian's tiles."""
-    index, column = tl.arange(0, ROWS), tl.arange(0, COLUMNS)[None, :]
+    index = tl.arange(0, ROWS)
+    column = tl.arange(0, COLUMNS)[None, :]
     every = tl.arange(0, 32)
     end = tl.load(part_count)
     which = tl.program_id(0)
@@ -191,7 +201,8 @@ def _list_parts(
         ellipse, first_row, last_row = _load_ellipse(
             means2d, radii, conics, opacities, g, True, tile_width, tile_height, PER_GAUSSIAN, TILE
         )
-        number, rows = part % _PLACE, last_row - first_row
+        number = part % _PLACE
+        rows = last_row - first_row
         begin = first_row + (rows * number // cut).to(tl.int32)
         last_row = first_row + (rows * (number + 1) // cut).to(tl.int32)
         while first_row < begin:  # Parts before this one take the places before this one's.
@@ -222,7 +233,8 @@ def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs,
 
     The first `of_pairs` programs handle LANES pairs each, the others LANES tiles, whose starts are found by bisection.
     """
-    program, lane = tl.program_id(0), tl.arange(0, LANES)
+    program = tl.program_id(0)
+    lane = tl.arange(0, LANES)
     if program < of_pairs:
         at = program.to(tl.int64) * LANES + lane
         exists = at < num_pairs
@@ -302,16 +314,20 @@ class PendingTiles:
         num_pairs = sum(self.pair_counts.wait()) if capacity is None else capacity
         rows_per_view = rows if capacity is None else rows + 1
         check_pairs(num_pairs)
-        num_tiles, device = views * rows_per_view * columns, self.ends.device
+        num_tiles = views * rows_per_view * columns
+        device = self.ends.device
         # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
         tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
-        n, per_gaussian = len(self.order), self.ellipses[1].dim() - 1
+        n = len(self.order)
+        per_gaussian = self.ellipses[1].dim() - 1
         # A Gaussian of p > _FEW_PAIRS pairs has at most p / _PART_PAIRS + 1 parts.
         most_parts = num_pairs // _PART_PAIRS + num_pairs // (_FEW_PAIRS + 1) + 1
         # Each of the two numbers begins at 16 bytes, because Triton would compile anew for what is less aligned.
-        parts, numbers = self.order.new_empty(most_parts), self.order.new_zeros(3)
-        part_count, overflowed = numbers[:1], numbers[2:]
+        parts = self.order.new_empty(most_parts)
+        numbers = self.order.new_zeros(3)
+        part_count = numbers[:1]
+        overflowed = numbers[2:]
         listed = (*self.ellipses, self.order, self.ends, tiles, ids, parts, part_count)
         _list[cdiv(n, _LANES),](
             *listed, overflowed, n, n // views, num_pairs, num_tiles, columns, rows, rows_per_view,
@@ -322,7 +338,8 @@ class PendingTiles:
             per_gaussian, self.tile_size, _PART_PAIRS, _PART_ROWS, _PART_COLUMNS, num_warps=1,
         )  # fmt: skip
         tiles, by_tile = tiles.sort(stable=True)
-        starts, ordered = ids.new_empty((views, rows_per_view, columns)), torch.empty_like(ids)
+        starts = ids.new_empty((views, rows_per_view, columns))
+        ordered = torch.empty_like(ids)
         of_pairs = cdiv(num_pairs, _ORDER_LANES)
         _order[of_pairs + cdiv(num_tiles, _ORDER_LANES),](
             tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs, num_pairs.bit_length(), _ORDER_LANES
@@ -342,9 +359,11 @@ def intersect_tiles(
     `tile_size`, in px, is a power of two. Give the device other work before asking the result for its lists.
     """
     num_views, num_gaussians = means2d.shape[:2]
-    tile_width, tile_height = cdiv(width, tile_size), cdiv(height, tile_size)
+    tile_width = cdiv(width, tile_size)
+    tile_height = cdiv(height, tile_size)
     ellipses = [value.contiguous() for value in (means2d, radii, conics, opacities)]
-    n, device = num_views * num_gaussians, means2d.device
+    n = num_views * num_gaussians
+    device = means2d.device
     counts = torch.empty(n, dtype=torch.int64, device=device)  # cumsum would convert others
     _count[cdiv(n, _LANES),](
         *ellipses, counts, n, tile_width, tile_height,

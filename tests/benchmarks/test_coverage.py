@@ -1,4 +1,4 @@
-"""Angles between held-out and training views, and what no training view covers, of geometry with known answers."""
+"""Angles between held-out and training views, of geometry with known answers."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from benchmarks.coverage import MAX_POINTS, Views, nearest_angles, thinned, uncovered_shares
+from benchmarks.coverage import MAX_POINTS, Views, nearest_angles, thinned
 from helpers.small_scenes import camera
 
-DEPTH, IMAGE = 4.0, 64 / 60 * 4
-"""Distance of the points that all cameras look at, and width of the images there."""
+DEPTH = 4.0
+"""Distance of the points that all cameras look at."""
 
 
 def looking(*poses: tuple[float, float]) -> Views:
@@ -47,22 +47,6 @@ def test_views_that_share_too_few_points_have_no_angle():
     few, behind = square()[:9], square(-DEPTH)
     for points in (few, behind, torch.cat([few, behind]), square(reach=100), torch.empty(0, 3)):
         assert nearest_angles(HERE, looking((5.0, 0.0)), points).isnan().all()
-
-
-def test_what_no_training_view_covers_is_told_as_a_share():
-    for aside, share in (([0.0], 0), ([0.5], 0.5), ([1.1], 1), ([0.5, -0.75], 0.25)):
-        training = looking(*((0.0, x * IMAGE) for x in aside))
-        assert uncovered_shares(HERE, training, square()).item() == pytest.approx(share)
-    assert uncovered_shares(HERE, HERE, square(-DEPTH)).isnan().all(), "the view sees no point"
-
-
-def test_each_pixel_takes_the_depth_of_the_nearest_point():
-    # Near on the left, far on the right; the training view stands beyond the near one, where the image of the far one
-    # is 3/4 as wide and high.
-    points = torch.tensor([[-0.25, 0.0, 1.0], [2.0, 0.0, 8.0]])
-    viewmats, Ks, sizes = looking((0.0, 0.0))
-    viewmats[0, 2, 3] = -2.0
-    assert uncovered_shares(HERE, Views(viewmats, Ks, sizes), points).item() == pytest.approx(1 - 0.5 * 0.75**2)
 
 
 def test_finite_points_are_thinned_evenly():
