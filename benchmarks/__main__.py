@@ -34,6 +34,7 @@ COMMANDS = {
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
     "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
     "cameras": ("cameras:Command", "how accurately cameras are placed, with several seeds and losses"),
+    "seconds": ("seconds:Command", "what a user waits for: the parts of a command side by side"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
     "disturbed": ("disturbed:Command", "copies of scenes in which things stand before some photos, and their masks"),

@@ -197,7 +197,8 @@ def main() -> None:
     nowhere = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
     try:
-        function = pkgutil.resolve_name(sys.argv[1])
+        with events.span("imports", function=sys.argv[1]):
+            function = pkgutil.resolve_name(sys.argv[1])
         with os.fdopen(channel, "rb", closefd=False) as given, suppress(EOFError):
             command, arguments = pickle.load(given)
             sys.argv = command or sys.argv

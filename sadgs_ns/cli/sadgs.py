@@ -20,6 +20,7 @@ from sadgs_ns.cli.program import exit_code, parse
 from sadgs_ns.cli.sadgs_options import Sadgs, read_train_options
 from sadgs_ns.cli.sadgs_stages import export, measure, place_cameras, train
 from sadgs_ns.cli.status_line import StatusLine, clock
+from sadgs_ns.events import span
 from sadgs_ns.interrupts import Interrupts, redirect_on_broken_pipe
 
 STAGES: dict[str, Callable[[PhotosToSplat, StatusLine], str]] = {
@@ -44,7 +45,7 @@ def make_splat(work: PhotosToSplat) -> list[Path]:
             if name == "measures" and not work.options.measure:
                 continue
             work.timeline.begin(*_FIRST_PARTS.get(name, (name, name)))
-            with StatusLine(name, work.console) as line:
+            with span(name), StatusLine(name, work.console) as line:
                 try:
                     line.update(stage(work, line))
                 except KeyboardInterrupt:

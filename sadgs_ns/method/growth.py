@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, Protocol
 
@@ -15,11 +15,13 @@ from torch import Tensor
 
 from sadgs_ns.method.ops import Optimizers, Params, State, opacities
 from sadgs_ns.method.schedule import Windows, due
-from sadgs_ns.method.split import children_per_axis, grid_split, num_children
+from sadgs_ns.method.split import MAX_CHILDREN_PER_AXIS, children_per_axis, grid_split, num_children
 from sadgs_ns.method.statistics import consistent
 
 SMALL_SCALE = 0.001
 """Largest scale, relative to the scene's extent, at which AbsGS counts a Gaussian as small (3DGS)."""
+FAINT_NEED = 1e-6
+"""Factor on η where what fills the cap is ranked: gradients decide, and η where there are none."""
 _OTHER_AXES = 0.8
 """Factor on the other axes of a Gaussian whose longest axis is halved (docs/results.md)."""
 
@@ -48,7 +50,8 @@ class Proposal:
     children: Tensor
     """Into how many a Gaussian is split along each of its axes; 1, 1, 1 leaves it whole. int64 [N, 3]"""
     priority: Tensor
-    """Those of the largest grow first, ≥ 0. [N]"""
+    """Those of the largest grow first, ≥ 0. [N]
+    Rules that are ranked together measure by how many times their threshold is exceeded."""
     split: Callable[[Any, Any, Any, Tensor], None] = grid_split
     """Puts children in the place of parents, in place, given parameters, optimizers, state and `children`."""
     clone: Tensor | None = None
@@ -80,15 +83,19 @@ class Rule:
 
 
 def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
-    """Split the axes on which η violated consistently, those of the largest η first (paper, section 3.5)."""
+    """Split the axes on which η violated consistently (paper, section 3.5).
+
+    An axis needs about √η children. Those come first whose axes need most for each Gaussian that the split adds.
+    """
     violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)  # [N, 3]
     is_opaque = opacities(params) >= options.split_min_opacity  # [N]
     violates &= is_opaque[:, None]
     eta_max = state["eta_max"]  # [N, 3]
-    worst = torch.where(violates, eta_max, 0.0).amax(dim=1)  # [N]
     counts = children_per_axis(eta_max, violates)
+    needed = torch.where(counts > 1, eta_max.sqrt(), 0.0).sum(dim=1)  # [N]
+    added = num_children(counts) - 1  # [N]
     split_into_grid = partial(grid_split, child_scale=options.child_scale)
-    return Proposal(counts, worst, split_into_grid)
+    return Proposal(counts, needed / added.clamp_min(1), split_into_grid)
 
 
 def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
@@ -97,17 +104,10 @@ def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposa
     The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of
     two that are 1.6 times as small on all axes are drawn at random, as 3DGS does.
     """
-    scales = params["scales"].detach()
-    count = state["grad_count"].clamp_min(1)
-    is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
-    mean_gradient = state["grad2d"] / count
-    mean_absolute = state["absgrad2d"] / count
-    clone_ratio = mean_gradient / options.clone_grad2d
-    split_ratio = mean_absolute / options.split_absgrad2d
-    steepness = torch.where(is_small, clone_ratio, split_ratio)  # From 1 on a Gaussian grows. [N]
+    is_small, steepness = _steepness(options, params, state)
     grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
     is_split = grows & ~is_small
-    longest = F.one_hot(scales.argmax(dim=-1), 3)  # [N, 3]
+    longest = F.one_hot(params["scales"].detach().argmax(dim=-1), 3)  # [N, 3]
     halved = longest * is_split[:, None]
     split_in_two = _split_at_random
     if options.absgs_long_axis:
@@ -115,11 +115,49 @@ def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposa
     return Proposal(1 + halved, steepness, split_in_two, clone=grows & is_small)
 
 
+def _steepness(options: Options, params: Params, state: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    """Return which Gaussians AbsGS counts as small, bool [N], and their gradients relative to its thresholds [N]."""
+    scales = params["scales"].detach()
+    count = state["grad_count"].clamp_min(1)
+    is_small = scales.exp().amax(dim=-1) <= SMALL_SCALE * state["scene_scale"]
+    mean_gradient = state["grad2d"] / count
+    mean_absolute = state["absgrad2d"] / count
+    clone_ratio = mean_gradient / options.clone_grad2d
+    split_ratio = mean_absolute / options.split_absgrad2d
+    return is_small, torch.where(is_small, clone_ratio, split_ratio)
+
+
+def refill(options: Options, params: Params, state: Mapping[str, Any], share: float) -> Proposal:
+    """Let all Gaussians grow as AbsGS does, so that their number can grow by a share.
+
+    The steepest come first, and among those without gradients, the largest η. Up to a share of 1 they are halved, and
+    above, they are cut into more parts along the longest axis.
+    """
+    is_small, steepness = _steepness(options, params, state)
+    parts = min(1 + math.ceil(share), MAX_CHILDREN_PER_AXIS)
+    is_cloned = is_small & (parts == 2)
+    longest = F.one_hot(params["scales"].detach().argmax(dim=-1), 3)  # [N, 3]
+    added = (parts - 1) * longest * ~is_cloned[:, None]
+    by_eta = FAINT_NEED * state["eta_max"].amax(dim=1)
+    need = torch.nan_to_num(steepness, nan=0.0, posinf=0.0)
+    return Proposal(1 + added, torch.maximum(need, by_eta), _halve, clone=is_cloned)
+
+
 RULES: dict[str, Rule] = {
     "structure": Rule(lambda windows: windows.structure_every, structure_aware, reads="statistics"),
     "absgs": Rule(lambda windows: windows.absgs_every, absgs, reads="gradients"),
 }
 """The rules by their names. Those that are due together share the step's budget, in this order."""
+
+
+def rivals(rule: Rule) -> list[Rule]:
+    """Return the rules that are ranked together with one where not all of its proposal fits.
+
+    Those are the rules that read the other part of the state, which is then kept, too.
+    """
+    if rule.reads is None:
+        return []
+    return [other for other in RULES.values() if other.reads not in (None, rule.reads)]
 
 
 def due_rules(iteration: int, windows: Windows) -> list[Rule]:
@@ -142,6 +180,44 @@ def apply(proposal: Proposal, allowed: Tensor, params: Params, optimizers: Optim
         counts = F.pad(counts, (0, 0, 0, num_clones), value=1)  # Clones are not split.
     if (counts > 1).any():
         proposal.split(params, optimizers, state, counts)
+
+
+def best_of(proposals: Sequence[Proposal]) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose for each Gaussian the proposal by which it grows with the largest priority.
+
+    Returns:
+        The index of its proposal, int64 [N], its growth, int64 [N], and its priority [N].
+    """
+    growths = torch.stack([proposal.growth for proposal in proposals])  # [P, N]
+    priorities = torch.stack([proposal.priority for proposal in proposals])  # [P, N]
+    priorities = torch.where(growths > 0, priorities, -1.0)
+    priority, chosen = priorities.max(dim=0)
+    growth = growths.gather(0, chosen[None])[0]
+    return chosen, growth, priority.clamp_min(0)
+
+
+@torch.no_grad()
+def apply_best(
+    proposals: Sequence[Proposal],
+    chosen: Tensor,  # int64 [N]
+    allowed: Tensor,  # bool [N]
+    params: Params,
+    optimizers: Optimizers,
+    state: State,
+) -> None:
+    """Let the `allowed` Gaussians grow, each as its `chosen` proposal says, in place."""
+    # Rows of the state move with their Gaussians, and those of new ones are empty.
+    for index, proposal in enumerate(proposals):
+        is_next = allowed & (chosen == index)
+        state[f"pending {index}"] = is_next
+        state[f"children {index}"] = proposal.children - 1
+        if proposal.clone is not None:
+            state[f"clone {index}"] = proposal.clone
+    for index, proposal in enumerate(proposals):
+        children = state.pop(f"children {index}") + 1
+        clone = state.pop(f"clone {index}", None)
+        is_next = state.pop(f"pending {index}")
+        apply(replace(proposal, children=children, clone=clone), is_next, params, optimizers, state)
 
 
 def _clone(is_cloned: Tensor, params: Any, optimizers: Any, state: Any) -> int:

@@ -18,7 +18,21 @@ from torch import Tensor
 
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
-from sadgs_ns.method.growth import RULES, Options, Proposal, Propose, Rule, apply, due_rules, structure_aware
+from sadgs_ns.method.budget import STATE_KEYS, Budget
+from sadgs_ns.method.growth import (
+    RULES,
+    Options,
+    Proposal,
+    Propose,
+    Rule,
+    apply,
+    apply_best,
+    best_of,
+    due_rules,
+    refill,
+    rivals,
+    structure_aware,
+)
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
@@ -183,6 +197,7 @@ class RunningStrategy(Strategy):
             # A structure step has pruned, and its children are fainter than what it kept.
             if not by_eta:
                 self._prune(params, optimizers, state, FINAL_PRUNE_OPACITY)
+            self._refill(params, optimizers, state, iteration, views)
             _drop_state(state)
         elif self._resets(iteration):
             map_opacities(lambda alpha: alpha * RESET_FACTOR, params, optimizers)
@@ -236,7 +251,8 @@ class RunningStrategy(Strategy):
         num_pruned = self._prune(params, optimizers, state, faint, is_low & (opacities(params) < PRUNE_OPACITY))
         map_opacities(lambda alpha: alpha.clamp_max(CLAMP_OPACITY), params, optimizers)
         num_violating, num_grown = self._grow(rules, params, optimizers, state, iteration, views)
-        _empty_state(params, state)  # Children have no observations yet.
+        if iteration < self.windows.refine_stop_iter:
+            _empty_state(params, state)  # Children have no observations yet.
         names = ("before", "violating", "low", "split", "pruned", "after")
         numbers = (num_before, num_violating, num_low, num_grown, num_pruned, len(params["means"]))
         of_all = dict(zip(names, self.world.sums(*numbers), strict=True))
@@ -248,7 +264,9 @@ class RunningStrategy(Strategy):
         """Let Gaussians grow by rules that do not read η, prune the faint, and empty the gradients that were read."""
         self._grow(rules, params, optimizers, state, iteration, views)
         self._prune(params, optimizers, state, self.options.min_opacity)
-        if any(rule.reads == "gradients" for rule in rules):
+        # At the end, what fills the cap reads the gradients, too.
+        was_read = any(rule.reads == "gradients" for rule in rules)
+        if was_read and iteration < self.windows.refine_stop_iter:
             state.update(empty_gradients(len(params["means"]), params["means"].device))
 
     def _grow(
@@ -287,22 +305,50 @@ class RunningStrategy(Strategy):
             The proposal, and which Gaussians grew, bool [N]; N is their number before.
         """
         proposal = rule.propose(self.options, params, state)
-        growth = proposal.growth
-        in_memory = self._room_in_memory(params, state, views)
         num_present = self.world.sums(len(params["means"]))[0]
-        under_cap = self.options.max_gaussians - num_present
-        room = min(under_cap, in_memory)
-        allowed = limit_growth(self.world, growth, proposal.priority, room // num_sharing)
-        wanted = self.world.sums(int(growth.sum()))[0]
-        allowed_by_cap = min(wanted, under_cap)
-        if in_memory < allowed_by_cap:
+        wanted = self.world.sums(int(proposal.growth.sum()))[0]
+        room = self._budget(state).room(num_present, wanted, iteration / self.windows.refine_stop_iter)
+        room = self._room_with_memory(wanted, room, params, state, iteration, views)
+        room = room // num_sharing
+        proposals = [proposal]
+        if wanted > room:
+            for rival in rivals(rule):
+                proposals.append(rival.propose(self.options, params, state))
+        chosen, growth, priority = best_of(proposals)
+        allowed = limit_growth(self.world, growth, priority, room)
+        apply_best(proposals, chosen, allowed, params, optimizers, state)
+        return proposal, allowed
+
+    def _refill(
+        self, params: Params, optimizers: Optimizers, state: State, iteration: int, views: Sequence[Info]
+    ) -> None:
+        """Let those grow that need it most until the cap is reached, in a run that would have outgrown it."""
+        num_present = self.world.sums(len(params["means"]))[0]
+        room = self.options.max_gaussians - num_present
+        if room <= 0 or not self._budget(state).outgrew_cap:
+            return
+        proposal = refill(self.options, params, state, room / num_present)
+        wanted = self.world.sums(int(proposal.growth.sum()))[0]
+        in_memory = self._room_with_memory(wanted, room, params, state, iteration, views)
+        allowed = limit_growth(self.world, proposal.growth, proposal.priority, in_memory)
+        apply(proposal, allowed, params, optimizers, state)
+
+    def _budget(self, state: State) -> Budget:
+        """Return the budget of the run, which its state keeps."""
+        return Budget(self.options.max_gaussians, state)
+
+    def _room_with_memory(
+        self, wanted: int, room: int, params: Params, state: State, iteration: int, views: Sequence[Info]
+    ) -> float:
+        """Return the room for more Gaussians, or less if memory lacks that; warn if it cannot hold what is wanted."""
+        in_memory = self._room_in_memory(params, state, views)
+        if in_memory < min(wanted, room):
             warnings.warn(
                 f"Iteration {iteration}: the device's memory holds {in_memory} more Gaussians, so at most these are "
                 "added. Lower max_gaussians, use smaller images, or end other programs on the device.",
-                stacklevel=3,
+                stacklevel=4,
             )
-        apply(proposal, allowed, params, optimizers, state)
-        return proposal, allowed
+        return min(room, in_memory)
 
     def _room_in_memory(self, params: Params, state: Mapping[str, Any], views: Sequence[Info]) -> float:
         """Return how many Gaussians can be added in all processes so that a step of such views fits; ≥ 0, or inf."""
@@ -343,7 +389,7 @@ def _empty_state(params: Params, state: State) -> None:
 
 def _drop_state(state: State) -> None:
     """Take the statistics and the screen gradients out of the state, for memory and checkpoints."""
-    for key in empty_state(0, torch.device("cpu")):
+    for key in (*empty_state(0, torch.device("cpu")), *STATE_KEYS):
         state.pop(key, None)
 
 

@@ -20,10 +20,22 @@ MOST_EFFORT = 100
 """Largest `effort`: a million iterations of four views for a capture of 760."""
 MOST_VIEWS = 4
 """Largest number of views in a step that is derived."""
-MORE_VISITS_FROM = (50, 90)
-"""Up to the first number of views, effort above 1 adds no visits; from the second on, it multiplies them."""
-GROWTH_WITH_EFFORT = (-0.32, 0.8)
-"""Power of effort that multiplies the thresholds of growth, and the least factor: effort 2 and more is 0.8."""
+FULL_VISITS_FROM = (50, 90)
+"""Up to the first number of views, visits grow with the square root of an effort above 1, because more of them overfit.
+From the second on, they grow with effort itself."""
+GROWTH_WITH_EFFORT = -0.32
+"""Power of effort above 1 that multiplies the thresholds of growth where views are many."""
+MORE_GROWTH_FROM = (20, 60)
+"""Up to the first number of views, effort leaves the thresholds of growth as they are; from the second on, its whole
+power multiplies them."""
+DROPOUT_FROM = 85
+"""Visits to each view above which Gaussians are left out of steps (docs/results.md#the-ladder)."""
+DROPOUT_PER_DOUBLING = 0.1
+"""Probability of being left out that each doubling of those visits adds, up to `DROPOUT_VIEWS` training views."""
+DROPOUT_VIEWS = 40
+"""Training views above which that probability falls as one over their number."""
+MOST_DROPOUT = 0.25
+"""Largest such probability."""
 DENSIFICATION_SHARE = 16 / 30
 """Share of a run in which Gaussians are added and removed."""
 RESETS_FROM = 600
@@ -70,8 +82,9 @@ def schedule(
 ) -> Schedule:
     """Derive the length of a run from the number of its training views, at least 1; given numbers stay.
 
-    With effort 1 the run visits views 2,000 + 50 · num_views times. Less effort, > 0, multiplies that; more effort
-    multiplies it if views are many (`MORE_VISITS_FROM`). A step takes one more view for every 2,000 visits, up to four.
+    With effort 1 the run visits views 2,000 + 50 · num_views times. Another effort, > 0, multiplies that; above 1 its
+    square root does so if views are few (`FULL_VISITS_FROM`). A step takes one more view for every 2,000 visits, up to
+    four.
     """
     visits = _view_visits(num_views, effort)
     if views_per_iteration is None:
@@ -88,12 +101,29 @@ def _view_visits(num_views: int, effort: float) -> float:
     """Derive how many view visits a run should have."""
     power = 1.0
     if effort > 1:
-        few, many = MORE_VISITS_FROM
-        power = (num_views - few) / (many - few)
-        power = max(power, 0.0)
-        power = min(power, 1.0)
-    visits = BASE_VISITS + VISITS_PER_VIEW * num_views
-    return effort**power * visits
+        power = (1 + _share_between(FULL_VISITS_FROM, num_views)) / 2
+    return effort**power * (BASE_VISITS + VISITS_PER_VIEW * num_views)
+
+
+def _share_between(bounds: tuple[int, int], num_views: int) -> float:
+    """Return 0 up to the first number of views, 1 from the second on, and linearly between them."""
+    few, many = bounds
+    share = (num_views - few) / (many - few)
+    share = max(share, 0.0)
+    return min(share, 1.0)
+
+
+def dropout(length: Schedule, num_views: int) -> float:
+    """Derive the probability with which a step leaves a Gaussian out, from how often the run visits each view.
+
+    It grows with the logarithm of these visits, from 0 at `DROPOUT_FROM` of them, and less if views are many.
+    """
+    visits_of_each = length.iterations * length.views_per_iteration / num_views
+    doublings = math.log2(max(visits_of_each, 1.0) / DROPOUT_FROM)
+    rate = DROPOUT_PER_DOUBLING * doublings
+    rate *= min(1.0, DROPOUT_VIEWS / num_views)
+    rate = max(rate, 0.0)
+    return min(rate, MOST_DROPOUT)
 
 
 @lru_cache(maxsize=64)
@@ -132,12 +162,11 @@ def next_due(iteration: int, every: int) -> float:
     return math.ceil(iteration / every) * every
 
 
-def growth_threshold(effort: float) -> float:
-    """Factor on the gradients at which AbsGS adds Gaussians: effort above 1 adds more of them."""
+def growth_threshold(effort: float, num_views: int) -> float:
+    """Factor on the gradients at which AbsGS adds Gaussians: effort above 1 adds more of them if views are many."""
     if effort <= 1:
         return 1.0
-    power, least = GROWTH_WITH_EFFORT
-    return max(effort**power, least)
+    return effort ** (GROWTH_WITH_EFFORT * _share_between(MORE_GROWTH_FROM, num_views))
 
 
 def between_one_and_four(views_per_iteration: int, at_four: float) -> float:

@@ -27,7 +27,8 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded; the largest violations are split first.
+    """Hard cap on the number of Gaussians, never exceeded.
+    A run that would outgrow it lets those grow first that need it most, and fills it when densification ends.
     On CUDA fewer are added, with a warning, if the device's memory cannot hold more."""
     structure_every: int | None = None
     """Iterations between structure-aware split and prune steps; None is a sixth of the run, 0 turns them off."""
@@ -52,10 +53,10 @@ class StructureAwareStrategy(Strategy):
     child_scale: float = 1.5
     """k in [1, 2): children are k times the paper's s/n long on the axes that are split, which closes their gaps.
     They stand closer and are 1/k as opaque an axis, which keeps the covariance and the mass; 1 is the paper's."""
-    clone_grad2d: float = 3.75e-4
+    clone_grad2d: float = 2.25e-4
     """AbsGS: normalised mean screen gradient at which a small Gaussian is cloned; AbsGS's own is 2e-4.
-    `ns-train` lowers this and the next one by up to 20 % for an effort above 1, and adds 25 % after a stereo start."""
-    split_absgrad2d: float = 7.5e-4
+    `ns-train` lowers this and the next one for an effort above 1 if views are many; a stereo start adds 25 %."""
+    split_absgrad2d: float = 4.5e-4
     """AbsGS: normalised mean absolute screen gradient at which a large Gaussian is split; AbsGS's own is 4e-4."""
     absgs_long_axis: bool = True
     """AbsGS halves a large Gaussian's longest axis in its place, instead of drawing the places of two at random."""

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sadgs_ns.data.checks.layouts import poses_elsewhere
+from sadgs_ns.events import span
 from sadgs_ns.placing import bit_depth
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_alpha, write_masks
@@ -75,24 +76,28 @@ def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
     with contextlib.ExitStack() as lock, start_colmap() as colmap:
         if scene.is_video:
             folder = scene.work / "frames"
-            photos = _take_frames(scene, folder, lock, report, say)
+            with span("frames"):
+                photos = _take_frames(scene, folder, lock, report, say)
         else:
             folder = scene.options.source
-            photos = _read_folder(scene, lock, report)
+            with span("photos"):
+                photos = _read_folder(scene, lock, report)
         views = sum(len(photo.views) for photo in photos)
         matching = choose_matching(scene.options.matching, views, scene.options.source.is_file())
         _describe_photos(scene, photos, say)
         if scene.added:  # An interrupted run may have made these without some of the photos.
             shutil.rmtree(scene.model, ignore_errors=True)
             shutil.rmtree(scene.work / "photos", ignore_errors=True)
-        folder, converted = _convert(scene, folder, photos, say)
+        with span("conversion"):
+            folder, converted = _convert(scene, folder, photos, say)
         groups, alike = _group_by_camera(scene, converted)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         arguments = (folder, groups, matching, scene.options.max_size, scene.model, scene.base, rigs, alike)
         longest_side = int(statistics.median(max(photo.size) for photo in photos))
         made = Summary(**make_model(colmap, *arguments, folder=scene.work, report=report))
         summary = dataclasses.replace(made, longest_side=longest_side)
-        publish(scene.work / "undistorted", scene.options.out, bool(scene.added))
+        with span("publishing"):
+            publish(scene.work / "undistorted", scene.options.out, bool(scene.added))
         if summary.is_poor and not scene.added:  # The features serve another way of matching.
             shutil.rmtree(scene.model)
         else:

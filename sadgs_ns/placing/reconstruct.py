@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pycolmap
 
 from sadgs_ns.errors import InputError
-from sadgs_ns.events import progress
+from sadgs_ns.events import progress, span
 from sadgs_ns.placing.adjustment import adjust_robustly, is_firm, refine, settle
 from sadgs_ns.placing.agreement import most_agreed
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
@@ -86,15 +86,19 @@ def make_model(
     database = model.with_name("database.db")
     gpu, nerfstudio = begin_imports()
     if not model.exists():
-        extract(photos, groups, database, rigs)
+        with span("features"):
+            extract(photos, groups, database, rigs)
         match(names, database, matching, gpu.result(), rigs)
-        place_cameras(photos, names, database, model, base, alike)
+        with span("placing"):
+            place_cameras(photos, names, database, model, base, alike)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
     made = pycolmap.Reconstruction(model)
     undistorted = model.with_name("undistorted")
-    undistort(photos, model, made, max_size, known)
+    with span("undistortion"):
+        undistort(photos, model, made, max_size, known)
     check_written(undistorted / "sparse" / "0", made)
-    with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
+    # nerfstudio prints all cameras where there are several.
+    with span("transforms.json"), contextlib.redirect_stdout(io.StringIO()):
         nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
     if rigs:
         hold_out_panoramas(undistorted / "transforms.json", rigs)
@@ -103,25 +107,34 @@ def make_model(
     moved = math.nan
     if disagreement_file.exists():  # A run of an earlier version, which is resumed, has none.
         moved = float(disagreement_file.read_text())
-    return summarize(names, made, database, matching, attempts, moved)
+    with span("summary"):
+        return summarize(names, made, database, matching, attempts, moved)
 
 
 @cache
 def begin_imports() -> tuple[Future[torch.device | None], Future[ModuleType]]:
     """Begin to import torch and nerfstudio's writer of scenes in a thread, because that takes seconds."""
     pool = ThreadPoolExecutor(1)
-    return pool.submit(wake_gpu), pool.submit(import_module, "nerfstudio.process_data.colmap_utils")
+    return pool.submit(wake_gpu), pool.submit(_import_writer)
+
+
+def _import_writer() -> ModuleType:
+    """Import nerfstudio's writer of scenes."""
+    with span("import of nerfstudio"):
+        return import_module("nerfstudio.process_data.colmap_utils")
 
 
 def wake_gpu() -> torch.device | None:
     """Import torch, and return the CUDA device if there is one, ready to compute."""
-    import torch
+    with span("import of torch"):
+        import torch
 
-    import_module("sadgs_ns.placing.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
+        import_module("sadgs_ns.placing.matching")  # `match` uses it, beside the import of nerfstudio in this thread.
     if not torch.cuda.is_available():
         return None
     device = torch.device("cuda")
-    torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))  # The first operations on a device start it.
+    with span("start of CUDA"):  # The first operations on a device start it.
+        torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))
     return device
 
 
@@ -178,24 +191,28 @@ def match(
     pair_list = database.with_name("pairs.txt")
     verification = verification_options(seed)
     progress(stage, 0, 1)
-    if matching == "similar":
-        panorama = {view: views[0] for views in rigs for view in views}
-        pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
-    else:
-        pairs = choose_pairs(names, rigs, matching)
+    with span("choice of pairs"):
+        if matching == "similar":
+            panorama = {view: views[0] for views in rigs for view in views}
+            pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
+        else:
+            pairs = choose_pairs(names, rigs, matching)
     if gpu is not None:
-        write_matches(database, pairs, gpu, stage)
+        with span("matches"):
+            write_matches(database, pairs, gpu, stage)
         # It verifies pairs that failed again each time, so all are verified in one call.
-        pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+        with span("verification"):
+            pycolmap.geometric_verification(database, two_view_geometry_options=verification)
     else:
-        rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
-        for start in range(0, len(pairs), _PAIRS):
-            progress(stage, start, len(pairs))
-            listed = ((a.translate(LISTED), b.translate(LISTED)) for a, b in pairs[start : start + _PAIRS])
-            pair_list.write_text("".join(f"{a} {b}\n" for a, b in listed), "utf8")
-            pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
-            pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
-        rename_images(database, UNLISTED)
+        with span("matches"):
+            rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
+            for start in range(0, len(pairs), _PAIRS):
+                progress(stage, start, len(pairs))
+                listed = ((a.translate(LISTED), b.translate(LISTED)) for a, b in pairs[start : start + _PAIRS])
+                pair_list.write_text("".join(f"{a} {b}\n" for a, b in listed), "utf8")
+                pairing = pycolmap.ImportedPairingOptions(match_list_path=pair_list)
+                pycolmap.match_image_pairs(database, pairing_options=pairing, verification_options=verification)
+            rename_images(database, UNLISTED)
     progress(stage, len(pairs), len(pairs))
 
 

@@ -74,6 +74,12 @@ class PoseOptimizerConfig(CameraOptimizerConfig):
     """Whether and how the cameras' poses were refined."""
 
 
+# What no measurement advises to change, and only the paper's presets or earlier runs do, would lengthen the help.
+hide("min_observations", "split_min_opacity", "child_scale", "min_opacity", "absgs_long_axis")(StructureAwareStrategy)
+hide("eta_every", "refine_start_iter", "reset_every")(StructureAwareStrategy)
+
+
+@hide("random_scale", "initial_opacity", "averaged_share", "max_off_axis")
 @dataclass
 class SadgsModelConfig(InstantiateConfig):
     """Options of the Gaussians, their loss and their densification; most of splatfacto's have no place here."""
@@ -102,7 +108,11 @@ class SadgsModelConfig(InstantiateConfig):
     A hundredth of them may lie on the bounding box; 0 sets no limit, as in the paper."""
     stereo_points: int | None = None
     """Largest number of points that are drawn from stereo depth of the training photos and added to the start (CUDA).
-    None is 150,000 if there are 3 to 60 training views, and otherwise 0."""
+    None is 150,000, or 0 with fewer than 3 training views or one SfM point for every 30 pixels of an image."""
+    dropout: float | None = None
+    """Probability with which a training step leaves a Gaussian out, in [0, 0.9], against overfitting of few views.
+    None follows from how often each view is rendered: 0 up to 85 times, and 0.1 more for each doubling, up to 0.25.
+    Above 40 training views it is the less, the more there are."""
     clear_paths: bool = True
     """Prune Gaussians that float near the cameras' paths, again and again; viewers of files would show them as haze."""
     initial_opacity: float = POINT_OPACITY
@@ -154,6 +164,7 @@ class SadgsModelConfig(InstantiateConfig):
             ("max_angular_scale", 0 <= angle < math.inf, "finite and not negative"),
             ("max_off_axis", off_axis == 0 or off_axis >= 1, "0, or at least 1, the image's border"),
             ("near_plane", is_near_plane, "viewers, scene, or positive and finite"),
+            ("dropout", self.dropout is None or 0 <= self.dropout <= 0.9, "in [0, 0.9]"),
             ("sh_degree", 0 <= self.sh_degree <= 3, "in [0, 3]"),
             ("num_random", 1 <= self.num_random <= _MOST_RANDOM, f"in [1, {_MOST_RANDOM:,}]"),
             ("starts_per_pixel", 0 <= self.starts_per_pixel < math.inf, "finite and not negative"),
@@ -204,6 +215,7 @@ def check_options(config: FullImageDatamanagerConfig) -> None:
     check_ranges("pipeline.datamanager.", config, ranges)
 
 
+@hide("epsilon", "energy_blur")
 @dataclass
 class SadgsPipelineConfig(VanillaPipelineConfig):
     """Options of the data, the model and the structure tensors of the images."""
@@ -214,8 +226,8 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     effort: float = 1.0
-    """How much training the capture gets, relative to what its number of views asks for.
-    0.5 is a draft of half as many renderings. 2 adds more Gaussians; 2 and 4 render more if there are many views."""
+    """How much training the capture gets, relative to what its number of views asks for: 0.25, 0.5, 1, 2, 4 or 8.
+    0.5 is a draft of half as many renderings. 2 renders up to twice as many, of more Gaussians if views are many."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
@@ -282,6 +294,7 @@ class SadgsViewerConfig(ViewerConfig):
 
 @hide("method_name", "prompt", "project_name", "relative_model_dir", "load_scheduler", "log_gradients")
 @hide("mixed_precision", "use_grad_scaler", "gradient_accumulation_steps")  # The check below refuses them.
+@hide("rates_follow_views")
 @dataclass
 class SadgsTrainerConfig(TrainerConfig):
     """Options of `ns-train sadgs`, checked before a run starts."""

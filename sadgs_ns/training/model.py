@@ -39,10 +39,11 @@ from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.datamanager import NUM_PIXELS
 from sadgs_ns.training.exposure_table import ExposureTable
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
+from sadgs_ns.training.lpips import load_lpips
 from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
-from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.run.run_plan import RunPlan
 from sadgs_ns.training.step.color_matrices import anchored
+from sadgs_ns.training.step.dropout import Dropout
 from sadgs_ns.training.step.parameter_average import RunningMean
 from sadgs_ns.training.step.poses import RefinedPoses, fit_poses
 
@@ -82,6 +83,7 @@ class SadgsModel(SplatfactoModel):
         self._lpips: list[torch.nn.Module | None] = []  # A list keeps its weights out of the checkpoint.
         self.step = 0
         self.average = RunningMean()
+        self.dropout: Dropout | None = None  # `follow` makes one if the plan asks for it.
         self.camera_positions: Tensor | None = None  # [C, 3]
         self.tile_forecast: TileForecast | None = TileForecast()
         self.color_matrices: torch.nn.Parameter | None = None  # [V, 3, 4]
@@ -173,6 +175,9 @@ class SadgsModel(SplatfactoModel):
         """From now on, densify, average and draw according to a plan."""
         self.plan = plan
         self.strategy = plan.strategy.for_run(plan.iterations, self.world)
+        self.dropout = None
+        if plan.dropout > 0:
+            self.dropout = Dropout(plan.dropout, torch.initial_seed(), self.device)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
@@ -586,15 +591,3 @@ class SadgsModel(SplatfactoModel):
         for name, parameter in self.gauss_params.items():
             parameter.data = torch.empty_like(dict[f"gauss_params.{name}"], device=self.device)
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
-
-
-def load_lpips(device: torch.device) -> torch.nn.Module | None:
-    """Return LPIPS (AlexNet), or None with a warning if its weights cannot be loaded."""
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    try:
-        with torch.random.fork_rng(devices=[]):  # Drawing weights must not change training's random state.
-            return LearnedPerceptualImagePatchSimilarity(normalize=True).to(device)
-    except Exception as error:
-        warn(f"LPIPS is not reported: its AlexNet weights could not be loaded ({error}).")
-        return None

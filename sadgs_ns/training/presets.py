@@ -57,6 +57,7 @@ def paper_pipeline(views_per_iteration: int) -> SadgsPipelineConfig:
             near_plane="scene",
             max_angular_scale=0.0,
             stereo_points=0,
+            dropout=0.0,
             clear_paths=False,
             starts_per_pixel=0.0,
             strategy=StructureAwareStrategy(

@@ -35,6 +35,7 @@ from sadgs_ns.errors import RunError
 from sadgs_ns.geometry.initialization import bounding_box_points, neighbour_scales
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method import running_strategy as strategy_module
+from sadgs_ns.method.budget import growth_share
 from sadgs_ns.method.growth import absgs
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients
 from sadgs_ns.method.split import children_per_axis
@@ -112,7 +113,8 @@ def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     params, state = random_params(50), observed(50, eta_max)
     before = {name: p.detach().clone() for name, p in params.items()}
-    short(max_gaussians=50 + 3 * 511 + 100).for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
+    cap = 50 + math.ceil((3 * 511 + 100) / growth_share(10 / 24))  # This step may use so much of it.
+    short(max_gaussians=cap).for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
     assert all(p.isfinite().all() for p in params.values())
     torch.testing.assert_close(params["scales"][47:].amin(), before["scales"][:3].amin() - math.log(8 / 1.5))

@@ -10,6 +10,7 @@ from sadgs_ns.method.schedule import (
     Schedule,
     Windows,
     between_one_and_four,
+    dropout,
     growth_threshold,
     schedule,
     windows,
@@ -33,7 +34,10 @@ def test_visits_grow_with_the_views_and_steps_take_more_views_where_they_can(num
 @pytest.mark.parametrize("effort", [0.01, 0.5, 1.0, 2.0, 4.0])
 def test_every_schedule_renders_what_the_effort_asks_for(num_views: int, effort: float):
     derived = schedule(num_views, effort=effort)
-    visits = (effort if effort <= 1 or num_views >= 100 else 1) * (2000 + 50 * num_views)
+    factor = effort
+    if effort > 1 and num_views <= 20:
+        factor = effort**0.5
+    visits = factor * (2000 + 50 * num_views)
     assert 1 <= derived.views_per_iteration <= min(MOST_VIEWS, num_views)
     rendered = derived.iterations * derived.views_per_iteration
     assert visits <= rendered < visits + derived.views_per_iteration
@@ -42,9 +46,9 @@ def test_every_schedule_renders_what_the_effort_asks_for(num_views: int, effort:
 
 @pytest.mark.parametrize(
     ("num_views", "factors"),
-    [(20, [0.5, 1, 1]), (50, [0.5, 1, 1]), (70, [0.5, 2**0.5, 2]), (90, [0.5, 2, 4]), (500, [0.5, 2, 4])],
+    [(20, [0.5, 2**0.5, 2]), (50, [0.5, 2**0.5, 2]), (70, [0.5, 2**0.75, 4**0.75]), (90, [0.5, 2, 4])],
 )
-def test_effort_above_1_adds_visits_only_where_views_are_many(num_views: int, factors: list[float]):
+def test_effort_above_1_adds_fewer_visits_where_views_are_few(num_views: int, factors: list[float]):
     visits = []
     for effort in (1.0, 0.5, 2.0, 4.0):
         derived = schedule(num_views, effort=effort)
@@ -52,11 +56,24 @@ def test_effort_above_1_adds_visits_only_where_views_are_many(num_views: int, fa
     assert [more / visits[0] for more in visits[1:]] == pytest.approx(factors, rel=2e-3)
 
 
-def test_effort_lets_more_grow_and_a_draft_as_much():
-    assert [growth_threshold(effort) for effort in (0.1, 0.5, 1.0)] == [1.0, 1.0, 1.0]
-    assert [growth_threshold(effort) for effort in (1.5, 2, 4, 100)] == pytest.approx(
-        [0.878, 0.801, 0.8, 0.8], abs=1e-3
-    )
+def test_effort_lets_more_grow_where_views_are_many_and_a_draft_as_much():
+    assert [growth_threshold(effort, 100) for effort in (0.1, 0.5, 1.0)] == [1.0, 1.0, 1.0]
+    assert [growth_threshold(effort, 100) for effort in (2, 4, 8)] == pytest.approx([0.801, 0.642, 0.514], abs=1e-3)
+    assert [growth_threshold(4, views) for views in (3, 20, 40, 60)] == pytest.approx([1, 1, 0.801, 0.642], abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("num_views", "rates"),
+    [(8, [0.082, 0.182, 0.232, 0.25]), (26, [0, 0.058, 0.108, 0.158]), (127, [0, 0, 0.020, 0.051])],
+)
+def test_gaussians_are_left_out_where_each_view_is_rendered_often(num_views: int, rates: list[float]):
+    derived = [dropout(schedule(num_views, effort=effort), num_views) for effort in (0.5, 1, 2, 4)]
+    assert derived == pytest.approx(rates, abs=1e-3)
+    assert derived == sorted(derived)
+
+
+def test_a_run_of_a_few_iterations_leaves_nothing_out():
+    assert dropout(Schedule(5, 1), 100) == 0
 
 
 def test_what_is_set_by_hand_stays():

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from gsplat.strategy.base import Strategy
 
 from helpers.small_scenes import adam, camera, random_params, training_step
-from sadgs_ns.method import growth
+from sadgs_ns.method import budget, growth
 from sadgs_ns.method import running_strategy as strategy_module
 from sadgs_ns.method.growth import RULES, Proposal, Rule, absgs, apply
 from sadgs_ns.method.schedule import Windows
@@ -27,6 +27,12 @@ WIDTH, HEIGHT = 64, 48
 def no_final_prune(monkeypatch: pytest.MonkeyPatch) -> None:
     """Faint Gaussians stay at the end of densification, where a test does not say otherwise."""
     monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.0)
+
+
+@pytest.fixture
+def whole_cap(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first step may use all of the cap."""
+    monkeypatch.setattr(budget, "growth_share", lambda progress: 1.0)
 
 
 def checker_images(views: int) -> torch.Tensor:
@@ -148,6 +154,7 @@ def longest(options: Any, params: Any, state: Any) -> Proposal:
     return Proposal(1 + F.one_hot(scales.argmax(dim=1), 3), scales.exp().amax(dim=1))
 
 
+@pytest.mark.usefixtures("whole_cap")
 def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch: pytest.MonkeyPatch):
     """It leaves gradients to AbsGS."""
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 3, longest))
@@ -159,6 +166,7 @@ def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch
     assert state["grad_count"].any() and strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
 
 
+@pytest.mark.usefixtures("whole_cap")
 @pytest.mark.parametrize("reads", [None, "statistics", "gradients"])
 def test_a_rule_of_growth_may_stand_alone(reads: Any, monkeypatch: pytest.MonkeyPatch):
     rules = {"longest": Rule(lambda windows: 10, longest, reads)}
@@ -182,6 +190,7 @@ def recorded(asked: list[tuple[str, int]], name: str, propose: Any) -> Any:
     return propose_and_record
 
 
+@pytest.mark.usefixtures("whole_cap")
 def test_rules_that_are_due_together_share_the_budget_of_a_step(monkeypatch: pytest.MonkeyPatch):
     """The cap leaves room for 40: half is the first rule's, and what it leaves is the second one's."""
     asked: list[tuple[str, int]] = []
@@ -191,7 +200,8 @@ def test_rules_that_are_due_together_share_the_budget_of_a_step(monkeypatch: pyt
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 5, recorded(asked, "longest", longest)))
     strategy = short(max_gaussians=100, absgs_every=5, clone_grad2d=1e-9, split_absgrad2d=1e-9, structure_every=10)
     _, state, counts = train(strategy, 5)
-    assert asked == [("absgs", 60), ("longest", 80)] and counts[-1] == 100
+    assert asked == [("absgs", 60), ("structure", 60), ("longest", 80)], "AbsGS's is ranked together with η's"
+    assert counts[-1] == 100
     assert not state["grad_count"].any(), "AbsGS has read them"
     asked.clear()
     strategy.max_gaussians = 1000
@@ -452,8 +462,8 @@ def test_what_would_be_split_now_keeps_to_the_cap():
         return strategy.for_run(3000).planned_children(params, statistics)
 
     assert planned().tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
-    strategy.max_gaussians = 5  # room for two more: the larger η comes first
-    assert planned().tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    strategy.max_gaussians = 5  # room for two more: √4 for one comes before √9 for two
+    assert planned().tolist() == [[2, 1, 1], [1, 1, 1], [1, 1, 1]]
     strategy.max_gaussians = 2
     assert (planned() == 1).all()
     strategy.max_gaussians, strategy.min_observations = 6, 2

@@ -42,7 +42,8 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training import model as model_module
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.model import SadgsModel, load_lpips
+from sadgs_ns.training.lpips import load_lpips
+from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.presets import RATES
 from sadgs_ns.training.run.trainer import SadgsTrainer
 from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam

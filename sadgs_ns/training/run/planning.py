@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 
 from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.method.schedule import Schedule, growth_threshold, schedule
+from sadgs_ns.method.schedule import Schedule, dropout, growth_threshold, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
@@ -27,6 +27,7 @@ LEAST_PIXELS = 1.5e6
 """Pixels of a step on each of several devices, below which one is quicker. With 1.9 and 3 million, two devices took
 1/1.1 of the time of one (1/1.3 in one run), and with .7 million 2.3 times as long (docs/results.md#several-devices)."""
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
+_THRESHOLD_OPTIONS = ("effort", "model.strategy.clone_grad2d", "model.strategy.split_absgrad2d")
 
 
 def decide_near_plane(config: SadgsModelConfig, of_scene: float | None, before: RunPlan | None) -> float:
@@ -116,6 +117,7 @@ def plan_run(
     """
     requested = _requested_options(config.pipeline)
     _warn_of_other_settings(requested, before)
+    views = len(pipeline.datamanager.train_dataset)
     strategy = _plan_strategy(pipeline, length, requested, dense, before)
     _print_length(config, pipeline, length, done)
     extent = float(pipeline.model.strategy_state["scene_scale"])
@@ -127,10 +129,23 @@ def plan_run(
         images=pipeline.datamanager.config.cache_images,
         near_plane=near_plane,
         max_off_axis=config.pipeline.model.max_off_axis,
+        dropout=plan_dropout(config.pipeline.model.dropout, length, views, before),
         strategy=strategy,
         rates=plan_rates(optimizers, length, extent, config.rates_follow_views),
         requested=requested,
     )
+
+
+def plan_dropout(option: float | None, length: Schedule, views: int, before: RunPlan | None) -> float:
+    """Decide the probability with which a step leaves a Gaussian out.
+
+    It is the option, or else that of the plan `before` of the checkpoint's run, or else the rule's.
+    """
+    if option is not None:
+        return option
+    if before is not None:
+        return before.dropout
+    return dropout(length, views)
 
 
 def _requested_options(options: SadgsPipelineConfig) -> dict[str, Any]:
@@ -168,19 +183,24 @@ def _plan_strategy(
     cap = strategy.max_gaussians
     if densifies:
         cap = _cap_in_memory(pipeline, length.views_per_iteration)
-        if before is not None and cap > before.strategy.max_gaussians and _asks_for_same_cap(requested, before):
+        if (
+            before is not None
+            and cap > before.strategy.max_gaussians
+            and _are_as_before(_CAP_OPTIONS, requested, before)
+        ):
             cap = before.strategy.max_gaussians
             note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
-    of_effort = growth_threshold(options.effort)
-    of_start = 1.0
+    factor = growth_threshold(options.effort, len(pipeline.datamanager.train_dataset))
     if dense:
-        of_start = DENSE_THRESHOLDS
-    planned = replace(
-        strategy,
-        max_gaussians=cap,
-        clone_grad2d=of_effort * strategy.clone_grad2d * of_start,
-        split_absgrad2d=of_effort * strategy.split_absgrad2d * of_start,
-    ).fitted(length.iterations)
+        factor *= DENSE_THRESHOLDS
+    clone_grad2d = factor * strategy.clone_grad2d
+    split_absgrad2d = factor * strategy.split_absgrad2d
+    if before is not None and _are_as_before(_THRESHOLD_OPTIONS, requested, before):
+        clone_grad2d = before.strategy.clone_grad2d
+        split_absgrad2d = before.strategy.split_absgrad2d
+    planned = replace(strategy, max_gaussians=cap, clone_grad2d=clone_grad2d, split_absgrad2d=split_absgrad2d).fitted(
+        length.iterations
+    )
     windows = planned.windows
     if densifies and windows.refine_stop_iter < windows.structure_every:
         warn(
@@ -202,9 +222,9 @@ def _cap_in_memory(pipeline: SadgsPipeline, views: int) -> int:
     return int(world.least(cap))
 
 
-def _asks_for_same_cap(requested: Mapping[str, Any], before: RunPlan) -> bool:
-    """Tell whether the options that decide the cap of Gaussians are those of the checkpoint's run."""
-    return all(before.requested.get(name, requested[name]) == requested[name] for name in _CAP_OPTIONS)
+def _are_as_before(names: Sequence[str], requested: Mapping[str, Any], before: RunPlan) -> bool:
+    """Tell whether options that decide something have the values of the checkpoint's run."""
+    return all(before.requested.get(name, requested[name]) == requested[name] for name in names)
 
 
 def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: Schedule, done: int) -> None:
@@ -223,7 +243,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
     if config.max_num_iterations is None:
         note(
             f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft, and 2 "
-            "resolves more."
+            "resolves more in twice the time."
         )
     requested = config.pipeline.views_per_iteration
     if requested is not None and requested > in_step:

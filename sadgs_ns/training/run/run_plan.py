@@ -48,6 +48,7 @@ class RunPlan:
     strategy: StructureAwareStrategy  # Densification with the run's windows, thresholds and cap
     rates: dict[str, Rate]  # Learning rates by group of parameters
     requested: dict[str, Any]  # Pipeline options from which this was derived, by their names
+    dropout: float = 0.0  # Probability with which a step leaves a Gaussian out
 
     @classmethod
     def of(cls, state: Mapping[str, Any]) -> RunPlan:

@@ -19,9 +19,12 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.progress import note
 
 FEWEST_VIEWS = 3
+"""Number of training views from which a run starts from stereo depth by default."""
 MOST_VIEWS = 60
-"""Numbers of training views with which a run starts from stereo depth by default. With more views it brought no PSNR
-and little else, for one to two seconds (docs/results.md#dense-start)."""
+"""Largest number of views whose depth is found. More take longer and show little that these do not."""
+PIXELS_OF_A_POINT = 30
+"""Pixels of an image for each SfM point, up to which SfM's points are many enough by themselves. Captures have either
+7 or 49 to 210 (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
@@ -36,12 +39,22 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
         return 0
     if requested is not None:
         return requested
-    if not FEWEST_VIEWS <= views <= MOST_VIEWS:
+    if views < FEWEST_VIEWS or _points_are_many(pipeline):
         return 0
     if pipeline.device.type != "cuda":
         note("The start has no points of stereo depth, which takes minutes on the CPU.")
         return 0
     return NUMBER
+
+
+def _points_are_many(pipeline: SadgsPipeline) -> bool:
+    """Tell whether SfM found so many points for the size of the images that stereo depth has little to add."""
+    cameras = pipeline.datamanager.train_dataset.cameras
+    pixels = float((cameras.width * cameras.height).double().mean())
+    points = 0
+    if pipeline.model.seed_points is not None:
+        points = len(pipeline.model.seed_points[0])
+    return points * PIXELS_OF_A_POINT >= pixels
 
 
 def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:

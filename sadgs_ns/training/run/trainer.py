@@ -228,6 +228,8 @@ class SadgsTrainer(Trainer):
         update = self.optimizers.update()
         factors = update.factors()
         nonfinite_flag = self.pipeline.log.nonfinite_flag
+        if model.dropout is not None:
+            model.dropout.begin(model.step)
         if self.graphed is not None:
             result = self.graphed.replay(groups, opacity_reg, update, factors, nonfinite_flag)
             if result is not None:

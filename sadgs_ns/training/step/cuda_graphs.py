@@ -47,13 +47,16 @@ class CudaGraphs:
         # The shared memory lives as long as one of its graphs, so this one is kept.
         self._first = self.capture(lambda: torch.zeros((), device=device))
 
-    def capture(self, function: Callable[[], Any]) -> Callable[[], Any]:
+    def capture(self, function: Callable[[], Any], generators: Sequence[torch.Generator] = ()) -> Callable[[], Any]:
         """Capture what a function launches, without running it, and return one that replays it.
 
         The results of all replays are the same tensors. The function may launch only kernels that were launched before,
-        since none may be compiled meanwhile. Raises as the function or RuntimeError; torch's own context would wait.
+        since none may be compiled meanwhile. It may draw random numbers of torch's own generator and of `generators`.
+        Raises as the function or RuntimeError; torch's own context would wait.
         """
         graph = torch.cuda.CUDAGraph()
+        for generator in generators:
+            graph.register_generator_state(generator)
         with torch.cuda.stream(self._stream):
             # Other threads load images and draw for the viewer meanwhile.
             graph.capture_begin(pool=self._pool, capture_error_mode="relaxed")
@@ -195,7 +198,10 @@ class GraphedSteps:
                 inputs = _Inputs.like(group, factors)
                 self._recorder = self._recorder or CudaGraphs(update.device)
                 step = partial(_captured_step, self._model, inputs, opacity_reg, update)
-                self._graphs[key] = self._recorder.capture(step), inputs
+                generators = []
+                if self._model.dropout is not None:
+                    generators.append(self._model.dropout.generator)
+                self._graphs[key] = self._recorder.capture(step, generators), inputs
             except Exception as error:  # CUDA, torch and Triton each raise their own.
                 self._give_up(error)
         self._launched.add(key)

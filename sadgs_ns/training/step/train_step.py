@@ -84,6 +84,8 @@ def training_step(
     if not world.is_single:
         opacity_reg *= len(leaves["means"]) / world.total  # The mean is over the Gaussians of all processes.
     gaussians, penalty = model.gaussians(leaves, opacity_reg)
+    if model.dropout is not None:
+        gaussians = model.dropout.apply(gaussians)
     if world.is_single and len(groups) == 1:
         # The kernel adds the penalty to the loss of a single group.
         losses, qualities, infos = _render_and_compare(model, groups, gaussians, leaves, penalty)

@@ -17,6 +17,7 @@ from examples.drawn_scene.scene import write_scene
 from helpers.kill_and_resume import configure, set_up
 from helpers.small_scenes import HEIGHT, ITERATIONS, VIEWS, WIDTH
 from sadgs_ns.cli import export
+from sadgs_ns.method import schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.types import RenderOptions
 from sadgs_ns.training.config import SadgsTrainerConfig
@@ -58,7 +59,10 @@ def plan_of(trainer: SadgsTrainer) -> RunPlan:
     return trainer.pipeline.model.plan
 
 
-def test_a_run_is_planned_once_and_its_options_stay_as_they_were_asked_for(config: SadgsTrainerConfig):
+def test_a_run_is_planned_once_and_its_options_stay_as_they_were_asked_for(
+    config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(schedule, "MORE_GROWTH_FROM", (1, 2))  # A scene of few views counts as one of many.
     config.pipeline.effort = 4.0
     asked = copy.deepcopy(config)
     trainer = set_up(config)
@@ -72,7 +76,7 @@ def test_a_run_is_planned_once_and_its_options_stay_as_they_were_asked_for(confi
             changed.iterations = changed.lr = 1  # type: ignore[misc]
 
     given = config.pipeline.model.strategy
-    assert plan.strategy.clone_grad2d == pytest.approx(0.8 * given.clone_grad2d)
+    assert plan.strategy.clone_grad2d == pytest.approx(4**-0.32 * given.clone_grad2d)
     assert (plan.iterations, plan.devices, plan.images) == (ITERATIONS, 1, "gpu")
     assert None not in vars(plan.strategy).values() and plan.near_plane == model.drawing.near_plane
     assert plan.rates.keys() == trainer.optimizers.optimizers.keys()

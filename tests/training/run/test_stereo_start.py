@@ -55,7 +55,9 @@ def test_points_near_the_surfaces_are_added_to_the_initial_ones_whatever_the_see
     assert (colors - drawn["points3D_rgb"][nearest]).abs().mean() < 0.12
 
 
-def test_few_views_start_from_stereo_depth_or_a_line_says_why_not(config: Any, monkeypatch: Any, capsys: Any):
+def test_few_points_are_joined_by_stereo_depth_or_a_line_says_why_not(config: Any, monkeypatch: Any, capsys: Any):
+    monkeypatch.setattr(stereo_start, "PIXELS_OF_A_POINT", 1)
+
     def check(says_so: bool) -> None:
         started = set_up(config).pipeline
         said = "no points of stereo depth, which takes minutes on the CPU." in " ".join(capsys.readouterr().out.split())
@@ -67,10 +69,11 @@ def test_few_views_start_from_stereo_depth_or_a_line_says_why_not(config: Any, m
     config.machine.device_type, model = "cpu", config.pipeline.model
     for model.stereo_points, model.random_init in ((0, False), (400, True), (None, True), (None, False)):
         check(model.stereo_points is None and not model.random_init)
-    for fewest, most in ((8, 8), (9, 60), (3, 7), (3, 60)):
+    sparse = WIDTH * HEIGHT // POINTS
+    for fewest, pixels_of_a_point in ((8, sparse), (9, sparse), (3, sparse + 1), (3, 1)):
         monkeypatch.setattr(stereo_start, "FEWEST_VIEWS", fewest)
-        monkeypatch.setattr(stereo_start, "MOST_VIEWS", most)
-        check(fewest <= TRAIN_VIEWS <= most)
+        monkeypatch.setattr(stereo_start, "PIXELS_OF_A_POINT", pixels_of_a_point)
+        check(fewest <= TRAIN_VIEWS and pixels_of_a_point <= sparse)
     config.pipeline.datamanager.dataparser = nerfstudio_data(config.output_dir / "data")
     check(False)
 
