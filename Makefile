@@ -46,7 +46,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo 'sadgs_ns needs Python 3.10, 3.11, 3.12 or 3.13, and "$(PYTHON)" is not one; name one: make PYTHON=python3.11' >&2; \
 	  exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	touch $@
 
 clean:

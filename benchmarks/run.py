@@ -80,8 +80,7 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
         config.seconds_per_save = 0
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 0
     config.output_dir = work
-    config.machine.seed = seed
-    datamanager.train_cameras_sampling_seed = seed  # nerfstudio's own generator: the seed above leaves it alone
+    _set_seed(config, seed)
     if not torch.cuda.is_available():
         config.machine.device_type = "cpu"
         datamanager.cache_images = "gpu"  # "the model's device"; "cpu" pins memory, which needs CUDA
@@ -92,6 +91,16 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
         if not path.resolve().is_relative_to(work.resolve()):
             raise ValueError(f"row {row.label!r} on {scene.name!r}: it would write {path}, outside the run's folder.")
     return config
+
+
+def _set_seed(config: TrainerConfig, seed: int) -> None:
+    """Set the seed of all that a run draws at random."""
+    from sadgs_ns.training.config import SadgsTrainerConfig
+
+    config.machine.seed = seed
+    datamanager: Any = config.pipeline.datamanager
+    if not isinstance(config, SadgsTrainerConfig):
+        datamanager.train_cameras_sampling_seed = seed  # The machine's seed leaves nerfstudio's own generator alone.
 
 
 def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:

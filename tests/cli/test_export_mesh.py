@@ -208,7 +208,8 @@ def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     assert capsys.readouterr().err == said
     monkeypatch.setitem(sys.modules, "open3d", None)  # Importing it fails.
     assert command(run, tmp_path / "a.mesh.ply") == 2
-    said = r"sadgs-export: A mesh is made by open3d, which cannot be imported \(.*\): install .* libusb-1\.0-0\.\n"
+    remedy = "install open3d and libusb-package with pip"
+    said = rf"sadgs-export: A mesh is made by open3d, which cannot be imported \(.*\): {remedy}\.\n"
     assert re.fullmatch(said, capsys.readouterr().err)
     assert not list(tmp_path.iterdir())
 

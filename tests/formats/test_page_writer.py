@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -13,10 +12,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from helpers.fake_node import put_node_into_path
 from sadgs_ns.cli.sadgs_options import choose_formats
 from sadgs_ns.formats import page_writer
 
-NPM = f"""#!/bin/sh
+NPM = f"""
 echo "$@" >> ran.txt
 grep -q integrity package-lock.json && mkdir -p {page_writer.PROGRAM.parent} && touch {page_writer.PROGRAM}
 """
@@ -25,12 +25,7 @@ grep -q integrity package-lock.json && mkdir -p {page_writer.PROGRAM.parent} && 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache without the program, and an npm that needs no network."""
-    programs = tmp_path / "programs"
-    programs.mkdir()
-    for name, script in {"npm": NPM, "node": "#!/bin/sh\n"}.items():
-        (programs / name).write_text(script)
-        (programs / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    put_node_into_path(tmp_path / "programs", "", NPM, monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "sadgs_ns"
 

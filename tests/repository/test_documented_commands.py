@@ -12,7 +12,6 @@ import inspect
 import os
 import re
 import shlex
-import shutil
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from benchmarks import protocol
 from examples.drawn_scene.scene import write_scene
 from helpers import forked_python
 from helpers.small_scenes import HEIGHT, POINTS, WIDTH
+from sadgs_ns.programs import put_ffmpeg_into_path
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "text", "yaml", "{button-link}"}
@@ -48,7 +48,7 @@ RUN_BY = {
     "test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was",
     "sadgs-process": "tests/placing/test_process.py::test_photos_are_registered_where_they_were_taken",
     "sadgs-export RUN/config.yml -o splat.html": "tests/cli/test_export.py::"
-    "test_a_page_opens_at_the_first_training_camera",
+    "test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s_name",
     "sadgs-export outputs/demo/sadgs/run/config.yml --output room.mesh.ply": "tests/cli/test_export_mesh.py::"
     "test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames",
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
@@ -251,8 +251,8 @@ def test_commands_that_no_other_test_runs_work_in_the_order_of_the_documents(tmp
     (tmp_path / "ROOT").mkdir()
     for name, target in (("ROOT/scene", "../scene"), ("DATA", "scene")):
         (tmp_path / name).symlink_to(target)
-    missing = {program for program in ("ffmpeg",) if shutil.which(program) is None}
-    lines = [shortened(command) for command in RUN_HERE if not any(f"needs {x}" in command.remark for x in missing)]
+    put_ffmpeg_into_path()
+    lines = [shortened(command) for command in RUN_HERE]
     commands = [shlex.split(line) for line in dict.fromkeys(lines)]
     # Where nothing listens, LPIPS, whose weights are a download, is left out at once.
     nowhere = dict.fromkeys(("http_proxy", "https_proxy"), "http://127.0.0.1:9")

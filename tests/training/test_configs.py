@@ -396,7 +396,7 @@ def test_everything_imported_is_required_by_us_or_by_nerfstudio():
     folders = ("sadgs_ns", "benchmarks", "examples", "tests")
     # Python 3.10 has no tomllib, for which tomli stands there.
     extras = project["optional-dependencies"]
-    for_tests = ours | requirements(extras["dev"] + extras["docs"])
+    for_tests = ours | requirements(extras["all"] + extras["dev"] + extras["docs"])
     local = {*folders, "helpers", "tomllib", *(path.stem for path in (CHECKOUT / "tests").rglob("*.py"))}
     distributions = packages_distributions()
     undeclared = []
