@@ -92,9 +92,8 @@ def cut_out(photos: Path, outline: Outline) -> CutOut:
         with Image.open(path) as image:
             photo = np.asarray(image.convert("RGB"))
     except OSError as error:
-        raise ValueError(
-            f"{path} cannot be read; give the folder of its folder as --photos, or no --photos."
-        ) from error
+        remedy = "give the folder that holds plush and mouse as --photos, or leave --photos out"
+        raise ValueError(f"{path} cannot be read; {remedy}.") from error
     corners = np.array(outline.corners, np.int32)
     left, top = np.maximum(corners.min(axis=0) - MARGIN, 0)
     right, bottom = corners.max(axis=0) + 1
@@ -116,9 +115,9 @@ def _move_to_edges(part: Pixels, inside: Pixels) -> Pixels:
     labels[cv2.erode(inside, disc) > 0] = cv2.GC_FGD
     cv2.setRNGSeed(0)
     # GrabCut writes its models of the colours to these, and reads no rectangle as there are labels.
-    behind = np.zeros((1, 65))
-    before = np.zeros((1, 65))
-    cv2.grabCut(part, labels, (0, 0, 0, 0), behind, before, ROUNDS, cv2.GC_INIT_WITH_MASK)
+    background = np.zeros((1, 65))
+    foreground = np.zeros((1, 65))
+    cv2.grabCut(part, labels, (0, 0, 0, 0), background, foreground, ROUNDS, cv2.GC_INIT_WITH_MASK)
     return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
 
 
