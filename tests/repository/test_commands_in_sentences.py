@@ -338,6 +338,7 @@ FILLED = {
     "sadgs -- --help": "sadgs -- --help",
     "sadgs …": "sadgs photos",
     "sadgs … --measure": "sadgs photos --measure",
+    "sadgs … --output …": "sadgs photos --output splat",
     "sadgs-process PHOTOS FOLDER": "sadgs-process PHOTOS FOLDER",
     "sadgs-export RUN --output room.mesh.ply": "sadgs-export RUN --output room.mesh.ply",
     "sadgs-export RUN --output splat.ply …": "sadgs-export RUN --output splat.ply --min-views 3",

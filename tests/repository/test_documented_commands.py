@@ -48,7 +48,7 @@ RUN_BY = {
     "test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_where_it_was",
     "sadgs-process": "tests/placing/test_process.py::test_photos_are_registered_where_they_were_taken",
     "sadgs-export RUN/config.yml -o splat.html": "tests/cli/test_export.py::"
-    "test_a_page_opens_at_the_first_training_camera",
+    "test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s_name",
     "sadgs-export outputs/demo/sadgs/run/config.yml --output room.mesh.ply": "tests/cli/test_export_mesh.py::"
     "test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames",
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
