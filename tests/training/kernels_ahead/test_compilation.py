@@ -48,9 +48,11 @@ def test_training_compiles_nothing_that_was_not_compiled_ahead(scene: Path, tmp_
 
 def test_without_a_gpu_there_is_nothing_to_compile(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
     trainer = SadgsTrainer(config)
-    monkeypatch.setattr(compilation, "Stages", None)  # which would fail if it were called
+    made: list[object] = []
+    monkeypatch.setattr(compilation, "Stages", lambda *choice: made.append(choice))
     trainer.setup()
     trainer.shutdown()
+    assert made == []
 
 
 def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):

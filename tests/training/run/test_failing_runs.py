@@ -273,6 +273,9 @@ def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
 def test_accumulating_over_one_iteration_is_what_everybody_does(config: SadgsTrainerConfig):
     config.gradient_accumulation_steps = {"means": 1}
     config.check()
+    config.gradient_accumulation_steps = {"means": 2}
+    with pytest.raises(InputError, match="gradient_accumulation_steps"):
+        config.check()
 
 
 # --- the disk ---

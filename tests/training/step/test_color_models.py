@@ -41,6 +41,7 @@ def run_of(scene: Path, output: Path, color_model: Any, iterations: int) -> Sadg
     config.pipeline.views_per_iteration = 1
     config.pipeline.model.color_model = color_model
     config.pipeline.model.exposure = "off"
+    config.pipeline.model.starts_per_pixel = 0.0  # All points: few tell too little of the exposures.
     config.pipeline.model.color_corrected_metrics = True
     config.optimizers["color_matrices"]["optimizer"].lr = 0.01  # Each photo is seen a dozen times.
     return config
