@@ -243,7 +243,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
     if config.max_num_iterations is None:
         note(
             f"The number of views and --pipeline.effort {config.pipeline.effort:g} decide this: 0.5 is a draft, and 2 "
-            "resolves more in twice the time."
+            "resolves more."
         )
     requested = config.pipeline.views_per_iteration
     if requested is not None and requested > in_step:

@@ -54,6 +54,7 @@ def exposed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_of(scene: Path, output: Path, exposure: Any = "auto", iterations: int = 2) -> SadgsTrainerConfig:
     config = configure(output, parser_of(scene), iterations)
+    config.pipeline.model.starts_per_pixel = 0.0  # On small images, too, all points
     config.machine.device_type = "cpu"
     config.pipeline.views_per_iteration = 1
     config.pipeline.model.exposure = exposure
