@@ -24,7 +24,7 @@ MOST_VIEWS = 60
 """Largest number of views whose depth is found. More take longer and show little that these do not."""
 PIXELS_OF_A_POINT = 30
 """Pixels of an image for each SfM point, up to which SfM's points are many enough by themselves. Captures have either
-7 or 49 to 210 (docs/results.md#dense-start)."""
+7 or 50 to 211 (docs/results.md#dense-start)."""
 
 
 def number_of_points(pipeline: SadgsPipeline) -> int:
