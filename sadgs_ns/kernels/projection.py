@@ -19,7 +19,17 @@ from torch.autograd.function import once_differentiable
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.projection_forward import project_forward
-from sadgs_ns.kernels.shared import clamped, drawn, equally_spaced_rows, load3, rotation, store3, unit_quaternion
+from sadgs_ns.kernels.shared import (
+    clamped,
+    drawn,
+    equally_spaced_rows,
+    load3,
+    load_intrinsics,
+    load_viewmat,
+    rotation,
+    store3,
+    unit_quaternion,
+)
 
 _LANES = 128  # Gaussians that one program handles
 
@@ -94,24 +104,8 @@ def _project_backward(
     for i in range(num_views):
         at = i * tl.cast(n, tl.int64) + g
         seen = drawn(radii, at, exists, PER_GAUSSIAN)
-        viewmat = viewmats + 16 * i
-        K = Ks + 9 * i
-        w00 = tl.load(viewmat)
-        w01 = tl.load(viewmat + 1)
-        w02 = tl.load(viewmat + 2)
-        t0 = tl.load(viewmat + 3)
-        w10 = tl.load(viewmat + 4)
-        w11 = tl.load(viewmat + 5)
-        w12 = tl.load(viewmat + 6)
-        t1 = tl.load(viewmat + 7)
-        w20 = tl.load(viewmat + 8)
-        w21 = tl.load(viewmat + 9)
-        w22 = tl.load(viewmat + 10)
-        t2 = tl.load(viewmat + 11)
-        fx = tl.load(K)
-        cx = tl.load(K + 2)
-        fy = tl.load(K + 4)
-        cy = tl.load(K + 5)
+        w00, w01, w02, t0, w10, w11, w12, t1, w20, w21, w22, t2 = load_viewmat(viewmats, i)
+        fx, fy, cx, cy = load_intrinsics(Ks, i)
         x = w00 * mean_x + w01 * mean_y + w02 * mean_z + t0
         y = w10 * mean_x + w11 * mean_y + w12 * mean_z + t1
         z = tl.where(seen, w20 * mean_x + w21 * mean_y + w22 * mean_z + t2, 1.0)

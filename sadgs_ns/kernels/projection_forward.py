@@ -21,7 +21,7 @@ from torch import Tensor
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import FAR_PLANE, NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import clamped, load3, rotation, store3, unit_quaternion
+from sadgs_ns.kernels.shared import clamped, load3, load_intrinsics, load_viewmat, rotation, store3, unit_quaternion
 
 _LANES = 128  # Gaussians that one program handles
 _LARGEST = tl.constexpr(1e9)  # Radius in px that int32 holds
@@ -69,24 +69,8 @@ def _project_forward(
 
     for i in range(num_views):
         at = i * tl.cast(n, tl.int64) + g
-        viewmat = viewmats + 16 * i
-        K = Ks + 9 * i
-        w00 = tl.load(viewmat)
-        w01 = tl.load(viewmat + 1)
-        w02 = tl.load(viewmat + 2)
-        t0 = tl.load(viewmat + 3)
-        w10 = tl.load(viewmat + 4)
-        w11 = tl.load(viewmat + 5)
-        w12 = tl.load(viewmat + 6)
-        t1 = tl.load(viewmat + 7)
-        w20 = tl.load(viewmat + 8)
-        w21 = tl.load(viewmat + 9)
-        w22 = tl.load(viewmat + 10)
-        t2 = tl.load(viewmat + 11)
-        fx = tl.load(K)
-        cx = tl.load(K + 2)
-        fy = tl.load(K + 4)
-        cy = tl.load(K + 5)
+        w00, w01, w02, t0, w10, w11, w12, t1, w20, w21, w22, t2 = load_viewmat(viewmats, i)
+        fx, fy, cx, cy = load_intrinsics(Ks, i)
         depth = _dot(w20, w21, w22, mean_x, mean_y, mean_z) + t2
         drawn = visible & (depth >= near_plane) & (depth <= FAR)
         inverse = 1 / tl.where(drawn, depth, 1.0)

@@ -35,6 +35,24 @@ def store3(values, at, x, y, z, exists, step=1):
 
 
 @triton.jit
+def load_viewmat(viewmats, view):
+    """Return the upper three rows of a view's matrix, row by row: of each the rotation's entries, then the shift."""
+    at = viewmats + 16 * view
+    return (
+        tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3),
+        tl.load(at + 4), tl.load(at + 5), tl.load(at + 6), tl.load(at + 7),
+        tl.load(at + 8), tl.load(at + 9), tl.load(at + 10), tl.load(at + 11),
+    )  # fmt: skip
+
+
+@triton.jit
+def load_intrinsics(Ks, view):
+    """Return fx, fy, cx and cy of a view, in px."""
+    at = Ks + 9 * view
+    return tl.load(at), tl.load(at + 4), tl.load(at + 2), tl.load(at + 5)
+
+
+@triton.jit
 def rotation(w, x, y, z):
     """Return the nine entries, row by row, of the rotation that a unit quaternion stands for."""
     return (

@@ -7,7 +7,7 @@ import triton.language as tl
 from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import drawn, load3, rotation, store3
+from sadgs_ns.kernels.shared import drawn, load3, load_intrinsics, rotation, store3
 
 _LANES = 128  # Gaussians that one program handles
 
@@ -116,13 +116,9 @@ def _observe(
         observed = observed & (tl.abs(s_xx) + tl.abs(s_xy) + tl.abs(s_yy) < float("inf"))
         # The Jacobian of gsplat's forward pass, with its clamp near the frustum's border.
         viewmat = viewmats + 16 * view
-        K = Ks + 9 * view
         depth = _matrix_row(viewmat, 2, x, y, z) + tl.load(viewmat + 11)
         depth = tl.where(seen, depth, 1.0)
-        fx = tl.load(K)
-        fy = tl.load(K + 4)
-        cx = tl.load(K + 2)
-        cy = tl.load(K + 5)
+        fx, fy, cx, cy = load_intrinsics(Ks, view)
         tangent_x = (_matrix_row(viewmat, 0, x, y, z) + tl.load(viewmat + 3)) / depth
         tangent_y = (_matrix_row(viewmat, 1, x, y, z) + tl.load(viewmat + 7)) / depth
         margin_x = MARGIN * 0.5 * width / fx
