@@ -40,6 +40,11 @@ def training_view(camera: Cameras) -> int | None:
     return int(number)
 
 
+def mean_pixels(cameras: Cameras) -> float:
+    """Return the mean number of pixels of C cameras' images."""
+    return float((cameras.height * cameras.width).double().mean())
+
+
 def check_camera_types(cameras: Cameras) -> None:
     """Raise InputError for the first of C cameras that neither is a pinhole nor becomes one, or that has no pixel.
 

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
+from sadgs_ns.data.cameras import mean_pixels
 from sadgs_ns.geometry.near_plane import scene_near_plane
 from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.schedule import Schedule, dropout, growth_threshold, schedule
@@ -83,7 +84,7 @@ def plan_length(config: SadgsTrainerConfig, views: int, before: RunPlan | None) 
 
 def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
     """Tell whether steps of this many views have too few pixels for several devices, and print it."""
-    pixels = views * _mean_pixels(cameras)
+    pixels = views * mean_pixels(cameras)
     needed = LEAST_PIXELS * devices
     if pixels >= needed:
         return False
@@ -93,11 +94,6 @@ def one_device_is_quicker(cameras: Cameras, views: int, devices: int) -> bool:
         "Gaussians, set --share-always True."
     )
     return True
-
-
-def _mean_pixels(cameras: Cameras) -> float:
-    """Return the mean number of pixels of the cameras' images."""
-    return float((cameras.height * cameras.width).double().mean())
 
 
 def plan_run(
@@ -237,7 +233,7 @@ def _print_length(config: SadgsTrainerConfig, pipeline: SadgsPipeline, length: S
         steps += f", of which {done:,} are done"
     times = round(length.iterations * in_step / views)
     note(
-        f"{config.method_name} on {views:,} training views of {_mean_pixels(cameras) / 1e6:.2g} megapixels: "
+        f"{config.method_name} on {views:,} training views of {mean_pixels(cameras) / 1e6:.2g} megapixels: "
         f"{steps}, so that each view is rendered about {times:,} {_plural('time', times)}."
     )
     if config.max_num_iterations is None:

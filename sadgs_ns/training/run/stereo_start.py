@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from sadgs_ns.data.cameras import mean_pixels
 from sadgs_ns.geometry.dense_start import NUMBER, dense_points
 from sadgs_ns.geometry.extents import plausible_points
 from sadgs_ns.geometry.point_colors import apply_gains
@@ -39,22 +40,15 @@ def number_of_points(pipeline: SadgsPipeline) -> int:
         return 0
     if requested is not None:
         return requested
-    if views < FEWEST_VIEWS or _points_are_many(pipeline):
+    cameras = pipeline.datamanager.train_dataset.cameras
+    number_of_sfm_points = len(model.seed_points[0])
+    has_many_points = number_of_sfm_points * PIXELS_OF_A_POINT >= mean_pixels(cameras)
+    if views < FEWEST_VIEWS or has_many_points:
         return 0
     if pipeline.device.type != "cuda":
         note("The start has no points of stereo depth, which takes minutes on the CPU.")
         return 0
     return NUMBER
-
-
-def _points_are_many(pipeline: SadgsPipeline) -> bool:
-    """Tell whether SfM found so many points for the size of the images that stereo depth has little to add."""
-    cameras = pipeline.datamanager.train_dataset.cameras
-    pixels = float((cameras.width * cameras.height).double().mean())
-    points = 0
-    if pipeline.model.seed_points is not None:
-        points = len(pipeline.model.seed_points[0])
-    return points * PIXELS_OF_A_POINT >= pixels
 
 
 def start_from_stereo(pipeline: SadgsPipeline, resumed: bool) -> bool:
