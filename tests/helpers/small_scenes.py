@@ -9,11 +9,14 @@ from torch import Tensor
 
 from helpers.gsplat_like import splatted
 from sadgs_ns.method.strategy import StructureAwareStrategy
+from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
 """Of the drawn scene that the fixture `scene` is."""
 ITERATIONS = 12
 """Of the run on it that the fixture `config` describes."""
+CHECKER_SIZE = 32, 24
+"""Width and height of the image of `train_on_checker`."""
 
 
 def random_params(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, torch.nn.Parameter]:
@@ -104,3 +107,22 @@ def training_step(
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
     strategy.step_post_backward(params, optimizers, state, step, info)
+
+
+def train_on_checker(
+    strategy: StructureAwareStrategy, params: dict[str, torch.nn.Parameter], steps: int
+) -> tuple[dict[str, Any], list[int]]:
+    """Train in a plain loop on a fine checker, in place; the strategy's state and the counts after each step."""
+    width, height = CHECKER_SIZE
+    torch.manual_seed(0)
+    optimizers = adam(params)
+    state = strategy.initialize_state()
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    image = (0.25 + 0.5 * ((x // 3 + y // 3) % 2).float())[None, ..., None].repeat(1, 1, 1, 3)
+    tensors = multiscale_structure_tensor(image)
+    viewmats, Ks = camera(width, height, focal=30.0)
+    counts = []
+    for step in range(steps):
+        training_step(strategy, params, optimizers, state, step, image, tensors, viewmats, Ks)
+        counts.append(len(params["means"]))
+    return state, counts

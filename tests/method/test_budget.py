@@ -13,7 +13,7 @@ from examples.drawn_scene import demonstration
 from examples.drawn_scene.scene import write_scene
 from helpers.gloo_ranks import run_ranks
 from helpers.kill_and_resume import configure, set_up
-from helpers.small_scenes import adam, camera, random_params, training_step
+from helpers.small_scenes import adam, random_params, train_on_checker
 from sadgs_ns.distributed.world import World
 from sadgs_ns.method import budget
 from sadgs_ns.method import running_strategy as strategy_module
@@ -21,9 +21,7 @@ from sadgs_ns.method.budget import STATE_KEYS, Budget, growth_share
 from sadgs_ns.method.growth import MAX_CHILDREN_PER_AXIS, apply, refill
 from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-WIDTH, HEIGHT = 32, 24
 START = 60
 
 
@@ -39,19 +37,9 @@ def options(**changes: Any) -> StructureAwareStrategy:
 
 def train(strategy: StructureAwareStrategy, steps: int = 26) -> tuple[dict[str, Any], dict[str, Any], list[int]]:
     """Train on a fine checker; return parameters, the strategy's state, and the number of Gaussians after each step."""
-    torch.manual_seed(0)
     params = random_params(START)
     params["scales"].data += 1.0
-    optimizers = adam(params)
-    state = strategy.initialize_state()
-    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    image = (0.25 + 0.5 * ((x // 3 + y // 3) % 2).float())[None, ..., None].repeat(1, 1, 1, 3)
-    tensors = multiscale_structure_tensor(image)
-    viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
-    counts = []
-    for step in range(steps):
-        training_step(strategy, params, optimizers, state, step, image, tensors, viewmats, Ks)
-        counts.append(len(params["means"]))
+    state, counts = train_on_checker(strategy, params, steps)
     return params, state, counts
 
 

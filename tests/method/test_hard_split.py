@@ -27,7 +27,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import configure, is_finite
-from helpers.small_scenes import adam, camera, random_params, training_step
+from helpers.small_scenes import CHECKER_SIZE, adam, camera, random_params, train_on_checker
 from sadgs_ns import kernels
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
@@ -41,7 +41,6 @@ from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradien
 from sadgs_ns.method.split import children_per_axis
 from sadgs_ns.method.statistics import empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
-from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render import step_memory
 from sadgs_ns.render.step_memory import StepSize
 from sadgs_ns.render.types import Cameras
@@ -52,7 +51,7 @@ from sadgs_ns.training.step.optimizers import AdamUpdate, FusedAdam
 from sadgs_ns.training.step.train_step import ViewGroup
 
 CPU = torch.device("cpu")
-WIDTH, HEIGHT = 32, 24
+WIDTH, HEIGHT = CHECKER_SIZE
 
 
 def short(**changes: Any) -> StructureAwareStrategy:
@@ -66,18 +65,8 @@ def short(**changes: Any) -> StructureAwareStrategy:
 
 def train(strategy: StructureAwareStrategy, params: dict[str, torch.nn.Parameter], steps: int = 22) -> list[int]:
     """Train in a plain loop on a fine checker, in place; the number of Gaussians after each step."""
-    torch.manual_seed(0)
-    optimizers = adam(params)
-    state = strategy.initialize_state()
-    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
-    image = (0.25 + 0.5 * ((x // 3 + y // 3) % 2).float())[None, ..., None].repeat(1, 1, 1, 3)
-    tensors = multiscale_structure_tensor(image)
-    viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
-    numbers = []
-    for step in range(steps):
-        training_step(strategy, params, optimizers, state, step, image, tensors, viewmats, Ks)
-        numbers.append(len(params["means"]))
-    return numbers
+    _, counts = train_on_checker(strategy, params, steps)
+    return counts
 
 
 def finite_or_infinite_logits(params: Any) -> bool:
