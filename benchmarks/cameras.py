@@ -24,7 +24,7 @@ from typing import Any
 from benchmarks import results
 from benchmarks.camera_table import markdown, markdown_of_truths
 from benchmarks.chain import now
-from benchmarks.photo_captures import PhotoCommand, load_protocol, photos_of
+from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, photos_of
 from benchmarks.side_by_side import environment_of
 from sadgs_ns.errors import InputError
 from sadgs_ns.placing.conversion import convert_photos
@@ -161,8 +161,7 @@ class Command(PhotoCommand):
         for table in (markdown(rows), markdown_of_truths(rows)):
             if table:
                 print(f"\n{table}")
-        keys = {job.key(variant) for job in jobs for variant in job.variants}
-        return int(any(row["status"] != "ok" for row in rows if row["key"] in keys))
+        return exit_status(rows, {job.key(variant) for job in jobs for variant in job.variants})
 
 
 def is_done(job: Job, rows: Sequence[Mapping[str, Any]]) -> bool:

@@ -25,7 +25,7 @@ from typing import Any
 
 from benchmarks import results
 from benchmarks.chain_table import markdown
-from benchmarks.photo_captures import PhotoCommand, load_protocol, photos_of
+from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, photos_of, write_row, written_row
 from benchmarks.side_by_side import environment_of
 
 INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
@@ -195,7 +195,7 @@ class Command(PhotoCommand):
     def __call__(self) -> int:
         """Run them; return 0, 1 if one failed, or 130 after an interrupt."""
         chains = self.chains()
-        done = {row["key"] for row in results.read(self.output, missing_ok=True) if row["status"] == "ok"}
+        done = self.done_keys()
         log = self.output.with_suffix(".log").resolve()
         todo = [chain for chain in chains if chain.key not in done]
         gpus: Sequence[str | None] = (None,)
@@ -206,7 +206,8 @@ class Command(PhotoCommand):
             return _start(chain, gpu, work, self.site, log)
 
         def ended(chain: Chain, code: int, work: Path) -> None:
-            row = written_row(chain, code, work)
+            problem = f"the chain ended with code {code} and no row; its process said why."
+            row = written_row(work, lambda: failed(chain, now(), problem))
             results.append(self.output, row)
             print(f"{chain.key}: {line(row)}", flush=True)
 
@@ -214,16 +215,7 @@ class Command(PhotoCommand):
             return 130
         rows = results.read(self.output)
         print(markdown(rows))
-        keys = {chain.key for chain in chains}
-        return int(any(row["status"] != "ok" for row in rows if row["key"] in keys))
-
-
-def written_row(chain: Chain, code: int, work: Path) -> dict[str, Any]:
-    """Return the row that a chain's process wrote, or one that says that it ended without."""
-    written = work / "row.json"
-    if written.exists():
-        return json.loads(written.read_text("utf8"))
-    return failed(chain, now(), f"the chain ended with code {code} and no row; its process said why.")
+        return exit_status(rows, {chain.key for chain in chains})
 
 
 def _start(chain: Chain, gpu: str | None, work: Path, site: Path | None, log: Path) -> subprocess.Popen[bytes]:
@@ -257,7 +249,7 @@ def main() -> None:
     if installed:
         site = Path(installed)
     row = row_of(chain, Path(work), site, Path(log))
-    (Path(work) / "row.json").write_text(json.dumps(row), "utf8")
+    write_row(Path(work), row)
 
 
 if __name__ == "__main__":

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from subprocess import Popen
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from tyro.conf import Positional
 
+from benchmarks import results
 from benchmarks.side_by_side import run_side_by_side, sigterm_exits
 
 SUFFIXES = {".jpg", ".jpeg", ".png"}
+_ROW_FILE = "row.json"  # In the folder of a process
 
 Job = TypeVar("Job")
 Protocol = TypeVar("Protocol")
@@ -71,3 +74,26 @@ class PhotoCommand:
             except KeyboardInterrupt:
                 return False
         return True
+
+    def done_keys(self) -> set[str]:
+        """Return the keys of the rows that ended well in an earlier call."""
+        rows = results.read(self.output, missing_ok=True)
+        return {row["key"] for row in rows if row["status"] == "ok"}
+
+
+def write_row(work: Path, row: Mapping[str, Any]) -> None:
+    """Leave the row of a process in its folder, where `written_row` finds it."""
+    (work / _ROW_FILE).write_text(json.dumps(row), "utf8")
+
+
+def written_row(work: Path, failed: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the row that a process left in its folder, or what `failed` returns if it ended without."""
+    written = work / _ROW_FILE
+    if written.exists():
+        return json.loads(written.read_text("utf8"))
+    return failed()
+
+
+def exit_status(rows: Sequence[Mapping[str, Any]], keys: Collection[str]) -> int:
+    """Return 1 if a row of these keys did not end well, otherwise 0."""
+    return int(any(row["status"] != "ok" for row in rows if row["key"] in keys))

@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks import results, seconds_plot
 from benchmarks.cameras import machine
 from benchmarks.chain import now
-from benchmarks.photo_captures import PhotoCommand, load_protocol, photos_of
+from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, photos_of, write_row, written_row
 from benchmarks.plots import save
 from benchmarks.run import software
 from benchmarks.seconds_table import Part, markdown
@@ -231,7 +231,7 @@ class Command(PhotoCommand):
     def __call__(self) -> int:
         """Run them one after the other; return 0, 1 if one failed, or 130 after an interrupt."""
         runs = self.chosen()
-        done = {row["key"] for row in results.read(self.output, missing_ok=True) if row["status"] == "ok"}
+        done = self.done_keys()
         todo = [run for run in runs if run.key not in done]
         log = self.output.with_suffix(".log").resolve()
 
@@ -240,7 +240,8 @@ class Command(PhotoCommand):
             return subprocess.Popen(command, env=environment_of(gpu), start_new_session=True)
 
         def ended(run: Run, code: int, work: Path) -> None:
-            row = written_row(run, code, work)
+            problem = f"the process ended with code {code} and no row; it said why."
+            row = written_row(work, lambda: run.row(now(), status="failed", error=problem))
             results.append(self.output, row)
             print(line(row), flush=True)
 
@@ -252,16 +253,7 @@ class Command(PhotoCommand):
             for name, figure in seconds_plot.figures(rows):
                 self.plots.mkdir(parents=True, exist_ok=True)
                 save(figure, self.plots / f"{name}.png")
-        keys = {run.key for run in runs}
-        return int(any(row["status"] != "ok" for row in rows if row["key"] in keys))
-
-
-def written_row(run: Run, code: int, work: Path) -> dict[str, Any]:
-    """Return the row that the process of a run wrote, or one that says that it ended without."""
-    written = work / "row.json"
-    if written.exists():
-        return json.loads(written.read_text("utf8"))
-    return run.row(now(), status="failed", error=f"the process ended with code {code} and no row; it said why.")
+        return exit_status(rows, {run.key for run in runs})
 
 
 def line(row: Mapping[str, Any]) -> str:
@@ -278,7 +270,7 @@ def main() -> None:
     run = Run(**{**fields, "words": tuple(fields["words"])})
     work = Path(folder)
     row = row_of(run, work, Path(log))
-    (work / "row.json").write_text(json.dumps(row), "utf8")
+    write_row(work, row)
 
 
 if __name__ == "__main__":
