@@ -8,7 +8,6 @@ import json
 import os
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from typing import Any
 
 FILE = "SADGS_EVENTS"  # Environment variable that names a file, where a listener reads each event as a line of JSON
@@ -49,5 +48,5 @@ def _add_line(variable: str, fields: dict[str, Any]) -> None:
     if path:
         line = json.dumps(fields, default=dataclasses.asdict) + "\n"
         # The listener has made the file; one that it removed stays away.
-        with suppress(OSError), open(os.open(path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0) as file:
+        with contextlib.suppress(OSError), open(os.open(path, os.O_WRONLY | os.O_APPEND), "wb", buffering=0) as file:
             file.write(line.encode())
