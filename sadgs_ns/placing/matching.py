@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -24,9 +24,6 @@ from sadgs_ns.events import progress
 from sadgs_ns.placing.photos import threads
 from sadgs_ns.placing.plan import NEIGHBORS
 from sadgs_ns.placing.verification import Verifier
-
-if TYPE_CHECKING:
-    from sadgs_ns.placing.matching_ahead import MatchingAhead
 
 MAX_DISTANCE, MAX_RATIO = 0.7, 0.8
 """Largest angle between matching descriptors in radians, and its largest ratio to the next best's; COLMAP's."""
@@ -147,7 +144,8 @@ def write_matches(
     device: torch.device,
     stage: str,
     options: pycolmap.TwoViewGeometryOptions,
-    ahead: MatchingAhead | None = None,
+    matched: dict[tuple[int, int], np.ndarray] | None = None,
+    on_device: Mapping[int, Tensor] | None = None,
 ) -> None:
     """Match pairs of photos, verify the matches in threads meanwhile, and write both to COLMAP's database.
 
@@ -160,18 +158,19 @@ def write_matches(
         device: Where descriptors are compared.
         stage: The name under which progress is reported.
         options: Those of the verification, with a seed.
-        ahead: Matches some of the pairs before, and has descriptors on the device.
+        matched: Matches of some pairs of images that are not in the database yet; they are taken out.
+        on_device: Descriptors of some images that are on the device.
     """
     with pycolmap.Database.open(database) as opened, threads(os.cpu_count()) as pool:
-        source = _MatchSource(opened, device, ahead)
+        source = _MatchSource(opened, device, matched or {}, on_device or {})
         verifier = Verifier(opened, options, pool)
         waiting: list[tuple[_Matched, Future[pycolmap.TwoViewGeometry]]] = []
         for start in range(0, len(pairs), _SAVED_AT_ONCE):
             lot = []
             for one, other in pairs[start : start + _SAVED_AT_ONCE]:
                 if not opened.exists_two_view_geometry(source.ids[one], source.ids[other]):
-                    matched = source.match(one, other)
-                    lot.append((matched, verifier.submit(matched.first, matched.second, matched.matches)))
+                    pair = source.match(one, other)
+                    lot.append((pair, verifier.submit(pair.first, pair.second, pair.matches)))
             _save(opened, waiting)  # They were verified while this lot was matched.
             progress(stage, start, len(pairs))
             waiting = lot
@@ -200,10 +199,17 @@ def _save(opened: pycolmap.Database, pairs: Sequence[tuple[_Matched, Future[pyco
 class _MatchSource:
     """Finds the matches of pairs: in the database, among those that were matched ahead, or by its device."""
 
-    def __init__(self, opened: pycolmap.Database, device: torch.device, ahead: MatchingAhead | None) -> None:
+    def __init__(
+        self,
+        opened: pycolmap.Database,
+        device: torch.device,
+        matched: dict[tuple[int, int], np.ndarray],
+        on_device: Mapping[int, Tensor],
+    ) -> None:
         self.ids = {image.name: image.image_id for image in opened.read_all_images()}
         self._opened = opened
-        self._ahead = ahead
+        self._matched = matched
+        self._on_device = on_device
 
         @lru_cache(KEPT_PHOTOS)
         def read(image_id: int) -> Tensor:
@@ -219,9 +225,7 @@ class _MatchSource:
         second = max(one, other)
         if self._opened.exists_matches(first, second):
             return _Matched(first, second, self._opened.read_matches(first, second), is_new=False)
-        found = None
-        if self._ahead is not None:
-            found = self._ahead.matches.pop((one, other), None)
+        found = self._matched.pop((one, other), None)
         if found is None:
             found = match_descriptors(self._descriptors(one), self._descriptors(other)).cpu().numpy()
         if one > other:
@@ -230,6 +234,6 @@ class _MatchSource:
 
     def _descriptors(self, image_id: int) -> Tensor:
         """Return an image's descriptors on the device. uint8 [N, 128]"""
-        if self._ahead is not None and image_id in self._ahead.descriptors:
-            return self._ahead.descriptors[image_id]
+        if image_id in self._on_device:
+            return self._on_device[image_id]
         return self._read(image_id)

@@ -6,9 +6,7 @@ Each stage goes on where an interrupted run left it. Only the process of `colmap
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
-import json
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -34,9 +32,11 @@ from sadgs_ns.placing.matching_ahead import AlikePartners, MatchingAhead, Partne
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
+from sadgs_ns.placing.scene_files import hold_out_panoramas, write_transforms
 from sadgs_ns.placing.undistortion import Undistortion
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
 SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
@@ -101,8 +101,7 @@ def make_model(
         with span("scene's files"):
             undistortion.write_model(made)
             check_written(undistortion.folder / "sparse" / "0", made)
-            with contextlib.redirect_stdout(io.StringIO()):  # nerfstudio prints all cameras where there are several.
-                nerfstudio.result().colmap_to_json(undistortion.folder / "sparse" / "0", undistortion.folder)
+            write_transforms(made, undistortion.folder, nerfstudio.result().colmap_to_json)
             if rigs:
                 hold_out_panoramas(undistortion.folder / "transforms.json", rigs)
             summary = summarize_model(names, made, model, matching)
@@ -145,20 +144,6 @@ def wake_gpu() -> torch.device | None:
     with span("start of CUDA"):  # The first operations on a device start it.
         torch.zeros(2, 2, device=device).mm(torch.zeros(2, 2, device=device))
     return device
-
-
-def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
-    """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
-    described = json.loads(file.read_text())
-    first = {view: views[0] for views in rigs for view in views}
-    names = in_order([frame["file_path"] for frame in described["frames"]])
-    whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
-    chosen = list(dict.fromkeys(whole.values()))[4::10]
-    held_out = [name for name in names if whole[name] in chosen]
-    if held_out:
-        described["train_filenames"] = [name for name in names if whole[name] not in chosen]
-        described |= {"val_filenames": held_out, "test_filenames": held_out}
-        file.write_text(json.dumps(described, indent=4))
 
 
 def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> list[tuple[str, str]]:
@@ -208,9 +193,13 @@ def match(
     pair_list = database.with_name("pairs.txt")
     verification = verification_options(seed)
     progress(stage, 0, 1)
-    largest = None
+    matched: dict[tuple[int, int], np.ndarray] = {}
+    on_device: Mapping[int, torch.Tensor] = {}
+    largest: Mapping[int, torch.Tensor] = {}
     if ahead is not None:
         ahead.stop()
+        matched = ahead.matches
+        on_device = ahead.descriptors
         largest = ahead.largest
     with span("choice of pairs"):
         if matching == "similar":
@@ -221,7 +210,7 @@ def match(
             pairs = choose_pairs(names, rigs, matching)
     if gpu is not None:
         with span("matches"):
-            write_matches(database, pairs, gpu, stage, verification, ahead)
+            write_matches(database, pairs, gpu, stage, verification, matched, on_device)
     else:
         with span("matches"):
             rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.

@@ -1339,7 +1339,7 @@ def test_a_gpu_s_matches_are_verified_with_the_seed(tmp_path: Path, monkeypatch:
         device: torch.device,
         stage: str,
         options: pycolmap.TwoViewGeometryOptions,
-        ahead: None,
+        *ahead: Any,
     ) -> None:
         calls.append((*pairs, device, options.ransac.random_seed))
 
