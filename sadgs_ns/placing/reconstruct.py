@@ -99,9 +99,9 @@ def make_model(
                 place_cameras(photos, names, database, model, base, alike, on_adjusted=undistortion.begin)
         made = pycolmap.Reconstruction(model)
         with span("scene's files"):
-            undistortion.write_model(made)
+            without_lens = undistortion.write_model(made)
             check_written(undistortion.folder / "sparse" / "0", made)
-            write_transforms(made, undistortion.folder, nerfstudio.result().colmap_to_json)
+            write_transforms(without_lens, undistortion.folder, nerfstudio.result().colmap_to_json)
             if rigs:
                 hold_out_panoramas(undistortion.folder / "transforms.json", rigs)
             summary = summarize_model(names, made, model, matching)

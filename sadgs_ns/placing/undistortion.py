@@ -80,13 +80,15 @@ class Undistortion:
         pool = self._pool.enter_context(threads(_num_threads(self._cameras.values())))
         self._work = [pool.submit(self._write, image.name, image.camera_id) for image in registered]
 
-    def write_model(self, made: pycolmap.Reconstruction) -> None:
-        """Write the model of the images. Raise OSError if it is not complete."""
+    def write_model(self, made: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Write the model of the images, given that of the photos, and return it."""
         cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
         undistorted = {key: pycolmap.undistort_camera(self._options, camera) for key, camera in cameras.items()}
         sparse = self.folder / "sparse" / "0"
         sparse.mkdir(parents=True)
-        without_distortion(made, undistorted).write(sparse)
+        model = without_distortion(made, undistorted)
+        model.write(sparse)
+        return model
 
     def wait(self) -> None:
         """Wait until all images are written. Raise OSError if one cannot be."""

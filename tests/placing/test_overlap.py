@@ -193,4 +193,9 @@ def test_images_are_undistorted_while_the_model_is_written_and_again_after_an_in
     assert reconstruct.make_model(*arguments) == summary
     assert summary.registered == len(names)
     assert had_model == [False, True]
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    writer.result().colmap_to_json(undistorted / "sparse" / "0", theirs)
+    for file in ("transforms.json", "sparse_pc.ply"):
+        assert (undistorted / file).read_bytes() == (theirs / file).read_bytes()
     assert {file: (undistorted / file).read_bytes() for file in files} == written
