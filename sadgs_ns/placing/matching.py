@@ -6,7 +6,6 @@ matches runs in threads meanwhile.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from functools import lru_cache
@@ -21,7 +20,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sadgs_ns.events import progress
-from sadgs_ns.placing.photos import threads
+from sadgs_ns.placing.photos import num_cores, threads
 from sadgs_ns.placing.plan import NEIGHBORS
 from sadgs_ns.placing.verification import Verifier
 
@@ -161,7 +160,7 @@ def write_matches(
         matched: Matches of some pairs of images that are not in the database yet; they are taken out.
         on_device: Descriptors of some images that are on the device.
     """
-    with pycolmap.Database.open(database) as opened, threads(os.cpu_count()) as pool:
+    with pycolmap.Database.open(database) as opened, threads(num_cores()) as pool:
         source = _MatchSource(opened, device, matched or {}, on_device or {})
         verifier = Verifier(opened, options, pool)
         waiting: list[tuple[_Matched, Future[pycolmap.TwoViewGeometry]]] = []
@@ -211,7 +210,7 @@ class _MatchSource:
         self._matched = matched
         self._on_device = on_device
 
-        @lru_cache(KEPT_PHOTOS)
+        @lru_cache(max(1, KEPT_PHOTOS - len(on_device)))
         def read(image_id: int) -> Tensor:
             return torch.from_numpy(opened.read_descriptors(image_id).data.copy()).to(device)
 

@@ -5,6 +5,8 @@ What is matched here in vain costs the GPU alone, which has nothing else to do m
 
 from __future__ import annotations
 
+import bisect
+import contextlib
 import queue
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +22,8 @@ from sadgs_ns.placing.plan import NEIGHBORS
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
+
+_MOST_WAITING = 256  # Photos that may wait for the GPU, at 1 MB each; others are matched later.
 
 
 @dataclass(frozen=True)
@@ -42,7 +46,7 @@ class MatchingAhead:
     Without a GPU it does nothing. Call `stop` before its results are read. Leaving the context drops them.
 
     Attributes:
-        matches: Matches of pairs of images, by their numbers in the order of the pair. int64 [K, 2]
+        matches: Matches of pairs of images, by their numbers in the order of the pair. uint32 [K, 2]
         descriptors: Descriptors of images on the GPU. uint8 [N, 128]
         largest: Those of the largest features, as `matching.largest_descriptors` returns them.
     """
@@ -58,7 +62,7 @@ class MatchingAhead:
         self.descriptors: dict[int, Tensor] = {}
         self.largest: dict[int, Tensor] = {}
         self._partners = partners
-        self._photos: queue.SimpleQueue[PhotoFeatures | None] = queue.SimpleQueue()
+        self._photos: queue.Queue[PhotoFeatures | None] = queue.Queue(_MOST_WAITING)
         self._stopped = False
         self._pool = ThreadPoolExecutor(1)
         self._work = self._pool.submit(self._run, gpu)
@@ -72,9 +76,9 @@ class MatchingAhead:
             found.clear()  # The memory is needed elsewhere.
 
     def add(self, photo: PhotoFeatures) -> None:
-        """Let a photo be matched with those before it."""
+        """Let a photo be matched with those before it, unless too many wait."""
         if not self._work.done():
-            self._photos.put(photo)
+            self._put(photo)
 
     def stop(self) -> None:
         """End the thread when the present pair is matched, and raise what it raised."""
@@ -83,15 +87,19 @@ class MatchingAhead:
 
     def _end(self) -> None:
         self._stopped = True
-        self._photos.put(None)
+        self._put(None)  # The thread may wait for a photo.
         self._pool.shutdown()
+
+    def _put(self, photo: PhotoFeatures | None) -> None:
+        with contextlib.suppress(queue.Full):
+            self._photos.put_nowait(photo)
 
     def _run(self, gpu: Future[torch.device | None]) -> None:
         device = gpu.result()
         if device is not None:
             with span("matches ahead"):
                 self._match(device)
-        self._photos = queue.SimpleQueue()  # Photos that still wait are not kept in memory.
+        self._photos = queue.Queue(_MOST_WAITING)  # Photos that still wait are not kept in memory.
 
     def _match(self, device: torch.device) -> None:
         """Match photos until no more come, or `stop` is called."""
@@ -101,7 +109,7 @@ class MatchingAhead:
 
         while len(self.descriptors) < KEPT_PHOTOS:
             photo = self._photos.get()
-            if photo is None:
+            if photo is None or self._stopped:
                 return
             self.descriptors[photo.image_id] = torch.from_numpy(photo.descriptors).to(device)
             self.largest[photo.image_id] = largest_descriptors(photo.keypoints, photo.descriptors, device)
@@ -109,7 +117,7 @@ class MatchingAhead:
                 if self._stopped:
                     return
                 found = match_descriptors(self.descriptors[one], self.descriptors[other])
-                self.matches[one, other] = found.cpu().numpy()
+                self.matches[one, other] = found.cpu().numpy().astype(np.uint32)
 
 
 class PlannedPartners:
@@ -142,7 +150,7 @@ class AlikePartners:
     def __init__(self, rigs: Sequence[Sequence[str]]) -> None:
         self._panoramas = {view: views[0] for views in rigs for view in views}
         self._photos: list[PhotoFeatures] = []
-        self._counts: list[list[int]] = []  # Of each photo, its matches with others that came
+        self._nearest: list[list[int]] = []  # Of each photo, its matches with its nearest ones, the fewest first
 
     def __call__(self, photo: PhotoFeatures, largest: Mapping[int, Tensor]) -> list[tuple[int, int]]:
         """Return the pairs of a photo and those before it, the most similar ones first."""
@@ -155,13 +163,14 @@ class AlikePartners:
         chosen = []
         for place in sorted(range(len(counts)), key=lambda i: -counts[i]):
             count = counts[place]
-            is_near = len(chosen) < NEIGHBORS or count >= _least_of_nearest(self._counts[place])
+            is_near = len(chosen) < NEIGHBORS or count >= _least_of_nearest(self._nearest[place])
             if is_near and not self._is_same_panorama(photo, self._photos[place]):
                 chosen.append(self._ordered(self._photos[place], photo))
         for place, count in enumerate(counts):
-            self._counts[place].append(count)
+            bisect.insort(self._nearest[place], count)
+            del self._nearest[place][:-NEIGHBORS]
         self._photos.append(photo)
-        self._counts.append(counts)
+        self._nearest.append(sorted(counts)[-NEIGHBORS:])
         return chosen
 
     def _is_same_panorama(self, one: PhotoFeatures, other: PhotoFeatures) -> bool:
@@ -175,8 +184,8 @@ class AlikePartners:
         return other.image_id, one.image_id
 
 
-def _least_of_nearest(counts: Sequence[int]) -> int:
+def _least_of_nearest(nearest: Sequence[int]) -> int:
     """Return how many matches the last of a photo's neighbours has, 0 as long as it has too few neighbours."""
-    if len(counts) < NEIGHBORS:
+    if len(nearest) < NEIGHBORS:
         return 0
-    return sorted(counts)[-NEIGHBORS]
+    return nearest[0]

@@ -153,11 +153,18 @@ def searched(matching: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> 
     return folder / "database.db", pairs
 
 
-def test_matches_are_verified_as_by_colmap_bit_for_bit(matching: ModuleType, searched, tmp_path: Path):
+@pytest.mark.parametrize("has_focal_length", [False, True])
+def test_matches_are_verified_as_by_colmap_bit_for_bit(
+    matching: ModuleType, searched, tmp_path: Path, has_focal_length: bool
+):
     import pycolmap
 
     database, pairs = searched
     shutil.copyfile(database, tmp_path / "ours.db")
+    with pycolmap.Database.open(tmp_path / "ours.db") as opened:
+        for camera in opened.read_all_cameras():
+            camera.has_prior_focal_length = has_focal_length  # Then it looks for an essential matrix.
+            opened.update_camera(camera)
     matching.write_matches(tmp_path / "ours.db", pairs, torch.device("cpu"), "matches", verification_options())
     shutil.copyfile(tmp_path / "ours.db", tmp_path / "colmap.db")
     with pycolmap.Database.open(tmp_path / "colmap.db") as opened:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import threading
+import time
 from concurrent.futures import Future
 from pathlib import Path
 from types import ModuleType
@@ -117,6 +119,29 @@ def test_without_a_gpu_nothing_is_matched_and_no_photo_is_kept(ahead: ModuleType
         assert work._photos.empty()
         work.stop()
         assert not work.matches and not work.descriptors
+
+
+def test_photos_that_wait_too_long_are_left_out_and_none_is_matched_after_the_end(
+    ahead: ModuleType, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(ahead, "_MOST_WAITING", 3)
+    photos = ring_of_photos(ahead, 5)
+    gpu: Future[torch.device | None] = Future()
+    with ahead.MatchingAhead(gpu, ahead.AlikePartners([])) as work:
+        for photo in photos:
+            work.add(photo)
+        gpu.set_result(torch.device("cpu"))
+        while not work._photos.empty():
+            time.sleep(0.01)
+        work.stop()
+        assert set(work.descriptors) <= {photo.image_id for photo in photos[:3]}
+    gpu = Future()
+    with ahead.MatchingAhead(gpu, ahead.AlikePartners([])) as work:
+        for photo in photos:
+            work.add(photo)
+        threading.Timer(0.1, gpu.set_result, [torch.device("cpu")]).start()
+        work.stop()
+        assert not work.descriptors
 
 
 def test_an_error_of_the_thread_is_raised_and_an_error_of_the_block_ends_it(ahead: ModuleType):
