@@ -6,7 +6,6 @@ map passes through memory: forward writes three derivatives of SSIM, which backw
 
 Images stay [C, H, W, 3]: a row has 3W numbers, and a horizontal neighbour lies 3 numbers away. The window is symmetric,
 so that the adjoint of a blur is the same blur of the zero-padded map. Specialised sizes would make Triton compile anew.
-SSIM depends on E[x²] + E[y²] alone, so one blur serves both.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from sadgs_ns.kernels.limits import check_pixels
 from sadgs_ns.kernels.shared import reciprocal, store3
 
 _COLUMNS = 128  # Columns of numbers that one program handles
-_PROGRAMS = 924  # Programs that one launch has at most, if it can: so many an H100 or H200 runs at a time
+_PROGRAMS = 792  # Programs that one launch has at most, if it can: so many an H100 or H200 runs at a time
 _FEWEST_ROWS = 16  # Least rows of a strip; ten more are read for each
 _LANES = 1024  # Partial sums that are added at once
 _MARGIN = tl.constexpr(32)  # Zeros before the first row of derivatives; a window reaches 30 numbers to the left
@@ -62,13 +61,16 @@ def _add_row(windows, value, GAUSSIAN: tl.constexpr):
 
 
 @triton.jit
-def _slopes(e_x, e_y, e_squares, e_xy):
-    """Return SSIM of windows, and its derivatives by E[x], E[x²] and E[xy]; `e_squares` is E[x²] + E[y²]."""
+def _slopes(e_x, e_y, e_xx, e_yy, e_xy):
+    """Return SSIM of windows, and its derivatives by E[x], E[x²] and E[xy].
+
+    It depends on E[x²] + E[y²] alone, but one blur of both would err more where a photo is white.
+    """
     c1 = 0.01 * 0.01
     c2 = 0.03 * 0.03
     of_means = reciprocal(e_x * e_x + e_y * e_y + c1)
     luminance = (2 * e_x * e_y + c1) * of_means
-    of_variances = reciprocal(e_squares - e_x * e_x - e_y * e_y + c2)
+    of_variances = reciprocal(e_xx - e_x * e_x + e_yy - e_y * e_y + c2)
     structure = (2 * (e_xy - e_x * e_y) + c2) * of_variances
     by_xx = -luminance * structure * of_variances
     by_xy = 2 * luminance * of_variances
@@ -100,14 +102,16 @@ def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr
     square = zero
     of_x = _no_windows(GAUSSIAN, COLUMNS)
     of_y = of_x
-    of_squares = of_x
+    of_xx = of_x
+    of_yy = of_x
     of_xy = of_x
     for r in range(first, tl.minimum(last + reach, height)):
         x_row = x + (top + r * row + begin)
         y_row = y + (top + r * row + begin)
         e_x = zero
         e_y = zero
-        e_squares = zero
+        e_xx = zero
+        e_yy = zero
         e_xy = zero
         for k in tl.static_range(len(GAUSSIAN)):
             a = tl.load(x_row + 3 * k)
@@ -116,12 +120,13 @@ def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr
             wb = GAUSSIAN[k] * b
             e_x += wa
             e_y += wb
-            e_squares += wa * a
-            e_squares += wb * b
+            e_xx += wa * a
+            e_yy += wb * b
             e_xy += wa * b
         e_x, of_x = _add_row(of_x, e_x, GAUSSIAN)
         e_y, of_y = _add_row(of_y, e_y, GAUSSIAN)
-        e_squares, of_squares = _add_row(of_squares, e_squares, GAUSSIAN)
+        e_xx, of_xx = _add_row(of_xx, e_xx, GAUSSIAN)
+        e_yy, of_yy = _add_row(of_yy, e_yy, GAUSSIAN)
         e_xy, of_xy = _add_row(of_xy, e_xy, GAUSSIAN)
         i = top + r * row + c
         counted = inside & (r < last)
@@ -129,7 +134,7 @@ def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr
         absolute += tl.abs(difference)
         square += difference * difference
         if r >= first + reach:  # The windows that end here have begun in this strip.
-            of_window, by_x, by_xx, by_xy = _slopes(e_x, e_y, e_squares, e_xy)
+            of_window, by_x, by_xx, by_xy = _slopes(e_x, e_y, e_xx, e_yy, e_xy)
             similarity += tl.where(whole, of_window, 0.0)
             by_x = tl.where(whole, by_x, 0.0)
             by_xx = tl.where(whole, by_xx, 0.0)

@@ -98,7 +98,7 @@ def test_programs_of_the_loss_cover_the_images_and_run_at_the_same_time(size):
     views, height, row = size
     (columns, strips, of_views), rows = photometric._strips(*size)
     assert columns * photometric._COLUMNS >= row and strips * rows >= height and of_views == views
-    assert columns * strips * views <= 924
+    assert columns * strips * views <= photometric._PROGRAMS
 
 
 def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
