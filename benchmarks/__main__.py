@@ -29,7 +29,6 @@ COMMANDS = {
     "table": ("table_command:Command", "the table of a results file, and a plot of quality against time"),
     "views": ("view_table:Command", "the PSNR of each held-out view, and where it is far below"),
     "documents": ("documents:Command", "the tables and figures of the documents, from the rows of docs/results"),
-    "approximations": ("approximations:Command", "speed against error of the frequency analysis"),
     "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "kernels": ("kernel_share:Command", "what each Triton kernel brings: steps with its twin in its place (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),

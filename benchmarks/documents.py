@@ -107,15 +107,6 @@ class Source:
         found = table.groups(self.read(*rows))
         return table.of_sweep(found, labels, scenes)
 
-    def approximations(self, rows: str, of: str, input: str, variants: Sequence[str] | None = None) -> str:
-        """What `approximations` measured in an image, of some variants or of all."""
-        found = {}
-        for row in self.read(rows):
-            if (row["table"], row["input"]) == (of, input):
-                found[row["variant"]] = row
-        shown = variants or found
-        return table.of_approximations([found[name] for name in shown])
-
     def chain(self, rows: str, labels: Mapping[str, str]) -> str:
         """What `benchmarks.chain` measured, a line for each capture and label."""
         return chain_table.markdown(self.read(rows), labels)

@@ -109,22 +109,6 @@ def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     assert "| × 2 | .00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
-def test_approximations_are_printed_as_their_command_does(tmp_path: Path):
-    common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
-    rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
-    tables = {
-        "eta": {"kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo"},
-        "one": {
-            "kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo", "variants": ["1 sample"]
-        },
-    }  # fmt: skip
-    folder = checkout(tmp_path, tables, {"a.jsonl": rows})
-    assert bench.main(["documents", str(folder)]) == 0
-    text = (folder / "README.md").read_text("utf8")
-    assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
-    assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
-
-
 def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tmp_path: Path):
     change = {"rows": ["sweep.jsonl"], "change": ["T1", "T2"], "remark": "why"}
     lines = [

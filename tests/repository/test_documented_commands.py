@@ -54,8 +54,6 @@ RUN_BY = {
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
     "test_what_is_taken_away_is_told_and_not_in_the_file",
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
-    "python -m benchmarks approximations": "tests/benchmarks/test_approximations.py::"
-    "test_every_row_is_printed_and_written",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
