@@ -109,6 +109,17 @@ def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     assert "| × 2 | .00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
+def test_kernels_and_starts_are_tables_of_their_rows(tmp_path: Path):
+    ok = {"scene": "fox", "status": "ok"}
+    kernel = {**ok, "label": "adam", "by": "torch", "ratio": 1.25, "launches": 40.0}
+    start = {**ok, "label": "sadgs", "first": True, "wait": 9.0, "seconds": 20.0}
+    tables = {"kernels": {"kind": "kernels", "rows": "k.jsonl"}, "start": {"kind": "startup", "rows": "s.jsonl"}}
+    folder = checkout(tmp_path, tables, {"k.jsonl": [kernel], "s.jsonl": [start]})
+    assert bench.main(["documents", str(folder)]) == 0
+    text = (folder / "README.md").read_text("utf8")
+    assert "| adam | torch | 1.250 | 40 |" in text and "| sadgs | 9.0 | 20.0 | – | – |" in text
+
+
 def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tmp_path: Path):
     change = {"rows": ["sweep.jsonl"], "change": ["T1", "T2"], "remark": "why"}
     lines = [
