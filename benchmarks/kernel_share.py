@@ -123,11 +123,11 @@ def measure(part: Part, root: Path, devices: int, rounds: int, limit: float) -> 
 
 
 def rows_of(part: Part, loop: Loop) -> list[dict[str, Any]]:
-    """Return a row for the reference, if that is no part of a run with options, and for each twin."""
+    """Return a row for each twin, and for the reference if the run is that of one device without options."""
     reference = loop.measured[REFERENCE]
     rows = []
     for name, twin in part.twins.items():
-        if twin is None and part.is_short:
+        if twin is None and (part.is_short or loop.about["devices"] > 1):
             continue
         rows.append({**_identity(part.job, name, twin), **_of_steps(loop, loop.measured[name], twin), **loop.about})
     for name, twin in part.once.items():
@@ -166,10 +166,9 @@ def _of_steps(loop: Loop, measured: Measured, twin: Twin | None) -> dict[str, An
     milliseconds = {}
     for phase in loop.phases:
         milliseconds[phase.name] = statistics.median(measured.seconds[phase.name]) / phase.steps * 1e3
-    launches = None
-    if measured.launches:
-        of_phases = [phase.weight * measured.launches[phase.name] for phase in loop.phases]
-        launches = sum(of_phases) / sum(phase.weight for phase in loop.phases)
+    with_kernel = None
+    if twin is not None:
+        with_kernel = _launches(loop.phases, reference)
     graphs = measured.failure
     if twin is not None and twin.waits:
         graphs = "the host waits for the device in its place, so that no step can be a CUDA graph"
@@ -182,11 +181,22 @@ def _of_steps(loop: Loop, measured: Measured, twin: Twin | None) -> dict[str, An
         "rounds": len(ratios),
         "steps_seconds": seconds_of(loop.phases, measured),
         "ms": milliseconds,
-        "launches": launches,
+        "launches": _launches(loop.phases, measured),
+        "launches_with_kernel": with_kernel,
         "launches_of_phases": measured.launches,
         "replayed": measured.replayed,
         "no_graphs": graphs,
     }
+
+
+def _launches(phases: Sequence[Phase], measured: Measured) -> float | None:
+    """Return how many kernels a step of the run launches, or None where that was not counted."""
+    if not measured.launches:
+        return None
+    launches = 0.0
+    for phase in phases:
+        launches += phase.weight * measured.launches[phase.name]
+    return launches / sum(phase.weight for phase in phases)
 
 
 def _rounds_of(phases: Sequence[Phase], measured: Measured) -> int:

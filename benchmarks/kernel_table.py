@@ -11,7 +11,8 @@ from benchmarks.table import grid
 def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a line for each kernel, with the loop and the launches of a step of each scene.
 
-    The loop is relative to that with all kernels. A dash stands where nothing was measured.
+    The loop is relative to that with all kernels. Launches are those without and with the kernel. A dash stands where
+    nothing was measured.
     """
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     kernels = list(dict.fromkeys(row["label"] for row in rows))
@@ -42,6 +43,10 @@ def _loop(row: Mapping[str, Any] | None) -> str:
 
 
 def _launches(row: Mapping[str, Any] | None) -> str:
+    """Return the launches of a step with the twin, and of a step of the same run with the kernel."""
     if row is None or row.get("launches") is None:
         return "–"
-    return f"{row['launches']:.0f}"
+    launches = f"{row['launches']:.0f}"
+    if row.get("launches_with_kernel") is None:
+        return launches
+    return f"{launches} / {row['launches_with_kernel']:.0f}"

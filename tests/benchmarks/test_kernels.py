@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -209,7 +210,7 @@ def test_launches_are_kernels_of_the_gpu_without_copies():
 def loop(**measured: Measured) -> Loop:
     """Seconds of two rounds, of 8 steps of .5 s and of 4 steps of .25 s with all kernels: 5 s."""
     reference = Measured({"densification": [1.0, 1.0], "after": [0.5, 0.5]}, {"densification": 30.0, "after": 15.0})
-    return Loop(PHASES, {REFERENCE: reference, **measured}, {}, {"iterations": 12})
+    return Loop(PHASES, {REFERENCE: reference, **measured}, {}, {"iterations": 12, "devices": 1})
 
 
 def test_a_row_has_the_loop_relative_to_that_with_all_kernels():
@@ -217,11 +218,22 @@ def test_a_row_has_the_loop_relative_to_that_with_all_kernels():
     part = Part(JOB, {REFERENCE: None, "tiles": TWINS["tiles"]}, {}, is_short=False)
     first, second = kernel_share.rows_of(part, loop(tiles=tiles))
     assert first["label"] == REFERENCE and first["ratio"] == 1 and first["steps_seconds"] == 5
-    assert first["launches"] == 25
+    assert first["launches"] == 25 and first["launches_with_kernel"] is None
     assert second["key"] == "demo/tiles/0" and second["by"] == "gsplat" and second["launches"] == 50
+    assert second["launches_with_kernel"] == 25
     assert (second["low"], second["ratio"], second["high"]) == pytest.approx((7 / 5, 8 / 5, 9 / 5))
     assert second["ms"] == pytest.approx({"densification": 875, "after": 250})
     assert "host waits" in second["no_graphs"] and first["no_graphs"] == ""
+
+
+def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kernels():
+    part = Part(JOB, {REFERENCE: None, "poses": TWINS["poses"]}, {}, is_short=True)
+    measured = loop(poses=Measured({"densification": [1.0, 1.0], "after": [0.5, 0.5]}))
+    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
+    part = dataclasses.replace(part, is_short=False)
+    assert len(kernel_share.rows_of(part, measured)) == 2
+    measured.about["devices"] = 2
+    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
 
 
 def test_what_images_take_more_is_added_to_the_steps():
@@ -255,14 +267,16 @@ def test_one_device_measures_all_kernels_but_those_that_send_and_two_only_these(
 def test_the_table_has_a_line_for_each_kernel_and_columns_for_each_scene():
     ok = {"status": "ok", "by": "torch"}
     rows = [
-        ok | {"scene": "bonsai", "label": "adam", "ratio": 1.25, "low": 1.2, "high": 1.3, "launches": 41.4},
+        ok
+        | {"scene": "bonsai", "label": "adam", "ratio": 1.25, "low": 1.2, "high": 1.3, "launches": 41.4}
+        | {"launches_with_kernel": 30.0},
         ok | {"scene": "bonsai", "label": "quantization", "ratio": 1.002},
         {"status": "failed", "by": "torch", "scene": "site", "label": "adam", "error": "no"},
     ]
     assert kernel_table.markdown(rows).splitlines() == [
         "| Kernel | In its place | bonsai: loop | launches a step | site: loop | launches a step |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
-        "| adam | torch | 1.250 (1.200 to 1.300) | 41 | failed | – |",
+        "| adam | torch | 1.250 (1.200 to 1.300) | 41 / 30 | failed | – |",
         "| quantization | torch | 1.002 | – | – | – |",
     ]
 
