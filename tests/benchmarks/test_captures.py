@@ -108,7 +108,7 @@ def move_points(scene: Path) -> None:
     write_model(scene, points=[POINTS[0].replace("0.1 ", "0.15 "), POINTS[1]])
 
 
-CHANGES: dict[str, Callable[[Path], None]] = {
+CHANGES: dict[str, Callable[[Path], object]] = {
     "2 photos instead of 3": lambda scene: (scene / "images" / "a.png").unlink(),
     "the photos have 8×6 and 4×3 px instead of 8×6": lambda scene: write_photo(scene / "images" / "a.png", (4, 3)),
     "match, but not their names": lambda scene: shutil.move(scene / "images" / "a.png", scene / "images" / "z.png"),

@@ -57,6 +57,7 @@ RUN_BY = {
     "python -m benchmarks approximations": "tests/benchmarks/test_approximations.py::"
     "test_every_row_is_printed_and_written",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
+    "python -m benchmarks captures": "tests/benchmarks/test_captures.py::test_what_matches_is_told_to_match",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
     "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",
