@@ -42,8 +42,7 @@ RUN_BY = {
     "make lint": ".ci/run",
     "make gate": ".ci/run",
     "make docs": ".ci/run",
-    "make turn": "tests/drawn_scene/test_turn.py::"
-    "test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians",
+    "make turn": "tests/drawn_scene/test_turn.py::test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians",
     ".ci/run": ".github/workflows/tests.yml",
     "sadgs": "tests/cli/test_sadgs.py::test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing",
     "sadgs photos": "tests/cli/test_sadgs.py::"
