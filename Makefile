@@ -10,12 +10,13 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo turn test test-portable gate lint docs clean
+.PHONY: demo test test-portable gate lint docs clean
 
 demo: $(STAMP)
 	$(BIN)/python -m examples.drawn_scene
 
 # The moving picture and the splat of docs/gallery.md, trained on the CPU.
+.PHONY: turn
 turn: $(STAMP)
 	$(BIN)/python -m examples.drawn_scene.scene turn-output/demo --width 320 --height 240 --views 64
 	CUDA_VISIBLE_DEVICES= $(BIN)/ns-train sadgs --data turn-output/demo --output-dir turn-output --timestamp run \
