@@ -85,7 +85,9 @@ def test_signatures(function: Callable[..., Any]):
 def test_the_starts_of_tile_lists_take_four_arguments_by_their_places():
     """The second has another name in 1.5, n_images."""
     parameters = list(inspect.signature(gsplat.isect_offset_encode).parameters)
-    assert len(parameters) == 4 and parameters[0] == "isect_ids" and parameters[2:] == ["tile_width", "tile_height"]
+    assert len(parameters) == 4
+    assert parameters[0] == "isect_ids"
+    assert parameters[2:] == ["tile_width", "tile_height"]
 
 
 def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: pytest.MonkeyPatch):
@@ -128,12 +130,15 @@ def test_projection_and_harmonics_in_torch_are_gsplats_bit_by_bit(dtype: torch.d
     viewmats, Ks = (value.to(dtype) for value in cameras())
     viewmats[1, :3, 3] = torch.tensor([0.3, -0.2, 4.0])
     covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    assert covars is not None and torch.equal(ewa.covariances(quats, scales), covars)
+    assert covars is not None
+    assert torch.equal(ewa.covariances(quats, scales), covars)
     seen = _torch_impl._world_to_cam(means, covars, viewmats)
     found = ewa.world_to_camera(means, covars, viewmats)
-    assert torch.equal(found[0], seen[0]) and torch.equal(found[1], seen[1])
+    assert torch.equal(found[0], seen[0])
+    assert torch.equal(found[1], seen[1])
     projected, expected = (f(*seen, Ks, 40, 30) for f in (ewa.perspective, _torch_impl._persp_proj))
-    assert torch.equal(projected[0], expected[0]) and torch.equal(projected[1], expected[1])
+    assert torch.equal(projected[0], expected[0])
+    assert torch.equal(projected[1], expected[1])
     for degree in range(4):
         gradients = []
         for function in (ewa.spherical_harmonics, _torch_impl._spherical_harmonics):

@@ -146,7 +146,8 @@ def test_a_signal_is_passed_on_once_and_the_function_may_save(program):
 
     with pytest.raises(Interrupted, match="SIGTERM"), Interrupts(waiting=lambda: True):
         run(log, on_event=hear, saves=True)
-    assert heard == ["ready", "stopping"] and log.read_text("utf8") == "saved\n"
+    assert heard == ["ready", "stopping"]
+    assert log.read_text("utf8") == "saved\n"
 
 
 @pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence; the same command resumes")

@@ -59,19 +59,23 @@ def test_time_is_the_median_after_a_first_call():
         return len(calls)
 
     result, ms = timed(function, repeats=3)
-    assert result == 1 and len(calls) == 4 and ms >= 0
+    assert result == 1
+    assert len(calls) == 4
+    assert ms >= 0
 
 
 def test_time_on_a_cpu_is_the_processor_s():
     _, asleep = timed(lambda: time.sleep(0.05), repeats=1)
     _, awake = timed(lambda: sum(range(1_000_000)), repeats=1)
-    assert asleep < 10 and awake > 1
+    assert asleep < 10
+    assert awake > 1
 
 
 def test_spread_are_numpy_s_percentiles():
     errors = torch.rand(10, 41, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     expected = np.percentile(errors.numpy(), [50, 95, 100], method="nearest")
-    np.testing.assert_allclose(list(spread(errors).values()), expected, atol=0.01)
+    actual = list(spread(errors).values())
+    np.testing.assert_allclose(actual, expected, atol=0.01)
 
 
 def test_errors_are_those_that_were_planted():
@@ -89,7 +93,8 @@ def test_errors_are_those_that_were_planted():
 
 def test_the_reference_has_no_error_against_itself(tensor_rows: dict[str, dict[str, Any]]):
     row = tensor_rows["reference: float64"]
-    assert [row[name] for name in ("median", "p95", "max", "flips")] == [0.0] * 4
+    actual = [row[name] for name in ("median", "p95", "max", "flips")]
+    assert actual == [0.0] * 4
 
 
 def test_coarser_numbers_cost_accuracy(tensor_rows: dict[str, dict[str, Any]]):
@@ -108,7 +113,8 @@ def test_a_wrong_variant_is_detected(tensor_rows: dict[str, dict[str, Any]], mon
 
     monkeypatch.setattr(approximations, "multiscale_structure_tensor", wrong)
     rows = {row["variant"]: row for row in structure_tensor_rows(texture(), repeats=1)}
-    variant, untouched = "precision alone: float32", "storage alone: 8 bits"
+    variant = "precision alone: float32"
+    untouched = "storage alone: 8 bits"
     assert rows[variant]["median"] > 0.08 > 10 * tensor_rows[variant]["median"]
     assert rows[untouched]["median"] == tensor_rows[untouched]["median"]
 
@@ -129,7 +135,8 @@ def test_exact_average_is_the_brute_force_mean_of_the_ellipse_s_pixels(monkeypat
         offset = torch.stack([x, y], -1) - means2d[i]
         inside = ((offset @ torch.linalg.inv(axes[i])) ** 2).sum(-1) <= 4
         assert inside.sum() > 100
-        torch.testing.assert_close(actual[i], tensors[0][inside].mean(0), rtol=0.01, atol=2e-4)
+        expected = tensors[0][inside].mean(0)
+        torch.testing.assert_close(actual[i], expected, rtol=0.01, atol=2e-4)
     default, _ = average(tensors, footprints, quadrature(footprints))
     torch.testing.assert_close(default, actual, rtol=0.01, atol=2e-4)
     assert seen.all()
@@ -141,7 +148,8 @@ def test_many_samples_become_the_exact_average():
     tensors = multiscale_structure_tensor(texture())
     footprints = random_footprints(50, tensors)
     exact, seen = average(tensors, footprints, quadrature(footprints))
-    generator, means2d = torch.Generator().manual_seed(0), footprints.means2d
+    generator = torch.Generator().manual_seed(0)
+    means2d = footprints.means2d
     jitters = (torch.rand(means2d.shape, generator=generator) for _ in range(2000))
     samples = (sample_footprint(means2d, footprints.conics, jitter) for jitter in jitters)
     sampled, _ = average(tensors, footprints, samples)
@@ -152,10 +160,12 @@ def test_errors_decrease_with_samples():
     tensors = multiscale_structure_tensor(texture())
     rows = list(footprint_rows(tensors, random_footprints(4000, tensors), repeats=1))
     assert len(rows) == 1 + len(SAMPLES)
-    assert [rows[0][name] for name in ("median", "p95", "max", "flips")] == [0.0] * 4
+    actual = [rows[0][name] for name in ("median", "p95", "max", "flips")]
+    assert actual == [0.0] * 4
     for name in ("median", "p95", "flips"):
         errors = [row[name] for row in rows[1:]]
-        assert errors == sorted(errors, reverse=True) and errors[0] > 2 * errors[-1]
+        assert errors == sorted(errors, reverse=True)
+        assert errors[0] > 2 * errors[-1]
 
 
 def test_samples_that_do_not_spread_are_detected(monkeypatch: pytest.MonkeyPatch):
@@ -174,7 +184,8 @@ def test_samples_that_do_not_spread_are_detected(monkeypatch: pytest.MonkeyPatch
 def test_every_row_is_printed_and_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    image, output = tmp_path / "photo.png", tmp_path / "folder" / "rows.jsonl"
+    image = tmp_path / "photo.png"
+    output = tmp_path / "folder" / "rows.jsonl"
     cv2.imwrite(str(image), (255 * texture()[0]).byte().numpy())
     monkeypatch.setattr(approximations, "FOOTPRINTS", 60)
     arguments = ["approximations", "--image", str(image), "--repeats", "1"]
@@ -185,7 +196,8 @@ def test_every_row_is_printed_and_written(
     assert counts == {"structure_tensor": 5, "footprint": 1 + len(SAMPLES)}
     assert len({row["key"] for row in rows}) == len(rows) == sum(counts.values())
     for row in rows:
-        assert f"| {row['variant']} |" in printed and row["input"] == "photo.png"
+        assert f"| {row['variant']} |" in printed
+        assert row["input"] == "photo.png"
         assert APPROXIMATIONS[row["table"]].keys() <= row.keys()
         assert all(math.isfinite(value) for value in row.values() if isinstance(value, float))
 
@@ -200,7 +212,8 @@ def test_a_larger_photo_is_reduced(tmp_path: Path):
     path = tmp_path / "red.png"
     cv2.imwrite(str(path), np.tile(np.array([0, 0, 200], np.uint8), (30, 3200, 1)))  # BGR
     reduced = read_photo(path)
-    assert reduced.shape == (1, 15, 1600, 3) and bool((255 * reduced == torch.tensor([200, 0, 0])).all())
+    assert reduced.shape == (1, 15, 1600, 3)
+    assert bool((255 * reduced == torch.tensor([200, 0, 0])).all())
 
 
 @pytest.mark.parametrize(
@@ -224,5 +237,7 @@ def test_wrong_input_gets_one_sentence(
     (tmp_path / "empty.png").touch()
     assert bench.main(["approximations", *arguments, "--output", "rows.jsonl"]) == 2
     printed = capsys.readouterr()
-    assert printed.err.startswith(f"python -m benchmarks approximations: {sentence}") and printed.err.count("\n") == 1
-    assert printed.out == "" and not (tmp_path / "rows.jsonl").exists()
+    assert printed.err.startswith(f"python -m benchmarks approximations: {sentence}")
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert not (tmp_path / "rows.jsonl").exists()

@@ -30,11 +30,13 @@ OF_CAMERAS = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "di
 def expect_the_same(found: DataparserOutputs, expected: DataparserOutputs) -> None:
     """All that a parser makes is the same, to the bit."""
     for name in OF_CAMERAS:
-        mine, theirs = getattr(found.cameras, name), getattr(expected.cameras, name)
+        mine = getattr(found.cameras, name)
+        theirs = getattr(expected.cameras, name)
         if theirs is None:
             assert mine is None
         else:
-            assert mine.dtype == theirs.dtype and torch.equal(mine, theirs), name
+            assert mine.dtype == theirs.dtype, name
+            assert torch.equal(mine, theirs), name
     assert found.cameras.metadata == expected.cameras.metadata
     assert found.image_filenames == expected.image_filenames
     assert found.mask_filenames == expected.mask_filenames
@@ -45,7 +47,8 @@ def expect_the_same(found: DataparserOutputs, expected: DataparserOutputs) -> No
     if expected.alpha_color is None:
         assert found.alpha_color is None
     else:
-        assert found.alpha_color is not None and torch.equal(found.alpha_color, expected.alpha_color)
+        assert found.alpha_color is not None
+        assert torch.equal(found.alpha_color, expected.alpha_color)
 
 
 def lists(meta: dict[str, Any]) -> None:

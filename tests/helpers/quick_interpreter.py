@@ -37,7 +37,8 @@ def leave_out_overflow() -> None:
 def patch_language_once() -> None:
     """Put the interpreter's functions into `triton.language` once a launch, not at each call within a kernel, too."""
     patch = interpreter._patch_lang
-    restore = interpreter._LangPatchScope.restore
+    scopes: Any = interpreter._LangPatchScope
+    restore = scopes.restore
     patched: set[int] = set()
     """The ids of the modules that the launch has patched."""
 
@@ -45,7 +46,7 @@ def patch_language_once() -> None:
         modules = [value for value in function.__globals__.values() if value is tl or value is core]
         missing = {id(module) for module in modules} - patched
         if modules and not missing:
-            return interpreter._LangPatchScope()
+            return scopes()
         patched.update(missing)
         return patch(function)
 
@@ -54,7 +55,7 @@ def patch_language_once() -> None:
         restore(scope)
 
     interpreter._patch_lang = patch_once
-    interpreter._LangPatchScope.restore = restore_and_forget
+    scopes.restore = restore_and_forget
 
 
 def look_up_dtypes() -> None:
@@ -90,7 +91,8 @@ def keep_types_of_shapes() -> None:
 
 def keep_shapes_of_tensors() -> None:
     """Keep the shapes of tensors, as tuples of constants, and the products of their sizes."""
-    initialize = core.tensor.__init__
+    tensors: Any = core.tensor
+    initialize = tensors.__init__
     kept: dict[tuple[int, ...], Any] = {}
 
     def initialize_with_kept(tensor: Any, handle: Any, dtype: Any) -> None:
@@ -105,16 +107,17 @@ def keep_shapes_of_tensors() -> None:
         tensor.dtype = dtype.scalar
         tensor.shape, tensor.numel = kept[sizes]
 
-    core.tensor.__init__ = initialize_with_kept
+    tensors.__init__ = initialize_with_kept
 
 
 def broadcast_only_if_shapes_differ() -> None:
     """Return operands of one shape as they are; the interpreter finds out size by size that nothing is to be done."""
-    broadcast = TritonSemantic.broadcast_impl_value
+    semantics: Any = TritonSemantic
+    broadcast = semantics.broadcast_impl_value
 
     def broadcast_others(semantic: Any, left: Any, right: Any) -> Any:
         if left.type.is_block() and right.type.is_block() and left.type.shape.values == right.type.shape.values:
             return left, right
         return broadcast(semantic, left, right)
 
-    TritonSemantic.broadcast_impl_value = broadcast_others
+    semantics.broadcast_impl_value = broadcast_others

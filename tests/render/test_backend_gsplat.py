@@ -34,7 +34,8 @@ def drawn_by(
 ) -> dict[str, Tensor]:
     """Images, absolute and plain gradients of a random scene, and what was drawn, in float64 on the CPU."""
     values = {name: value.to(device, dtype) for name, value in random_scene(800, size, seed=0).items()}
-    viewmats, Ks = values["viewmats"].repeat(views, 1, 1), values["Ks"].repeat(views, 1, 1)
+    viewmats = values["viewmats"].repeat(views, 1, 1)
+    Ks = values["Ks"].repeat(views, 1, 1)
     viewmats[-1, 0, 3] = 0.4
     viewmats.requires_grad_(pose)
     leaves = {name: values[name].clone().requires_grad_() for name in ("means", "quats", "scales", "opacities")}
@@ -76,7 +77,8 @@ def test_it_draws_what_the_torch_backend_draws(case: str, per_axis_radii: bool, 
     assert torch.equal(ours.pop("visible"), seen := expected.pop("visible")) and seen.any()
     if case in ("off the axis", "near plane"):
         assert not seen.all()
-    assert ours.keys() == expected.keys() and "gradient of translations" in ours
+    assert ours.keys() == expected.keys()
+    assert "gradient of translations" in ours
     for name, value in expected.items():
         torch.testing.assert_close(ours[name], value, rtol=1e-9, atol=1e-12, msg=name)
 

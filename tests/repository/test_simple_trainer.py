@@ -18,7 +18,10 @@ from helpers.small_scenes import camera, random_params
 from sadgs_ns.method.strategy import StructureAwareStrategy
 
 CHECKOUT = Path(__file__).parents[2]
-WIDTH, HEIGHT, VIEWS, START = 64, 48, 3, 60
+WIDTH = 64
+HEIGHT = 48
+VIEWS = 3
+START = 60
 
 
 @dataclass
