@@ -127,6 +127,7 @@ def test_a_stage(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     assert archive.is_file()
 
 
+@pytest.mark.slow
 def test_a_protocol(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its row of half the effort, two iterations long, on a drawn scene, and the table of a document."""
     (shown,) = map(yaml.safe_load, blocks("A protocol to measure", "yaml"))
