@@ -36,7 +36,7 @@ from sadgs_ns.placing.plan import Summary
 from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.stamps import photo_stamps
 
-TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "1500"]
+TRAINING = ["--", "--max-num-iterations", "30", "--pipeline.model.strategy.max-gaussians", "500"]
 """More Gaussians take a second a step."""
 
 
@@ -187,6 +187,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert "(--max-size was 120, is 160); give another --output or delete it." in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.hard_case(
     "photos added to the folder of a finished `sadgs`, interrupted in each stage",
     "cameras are added, and another run is trained on all photos in the same frame; the "

@@ -77,7 +77,11 @@ def record_images(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("ranks", "views", "sizes"),
-    [(2, 2, [(WIDTH, HEIGHT)]), (2, 3, [(WIDTH, HEIGHT), (40, 30)]), (3, 1, [(WIDTH, 64)])],
+    [
+        (2, 2, [(WIDTH, HEIGHT)]),
+        pytest.param(2, 3, [(WIDTH, HEIGHT), (40, 30)], marks=pytest.mark.slow),
+        pytest.param(3, 1, [(WIDTH, 64)], marks=pytest.mark.slow),
+    ],
 )
 def test_processes_that_decode_what_they_composite_train_as_if_each_had_all_images(
     ranks: int, views: int, sizes: list[tuple[int, int]], tmp_path: Path
