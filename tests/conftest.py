@@ -91,7 +91,8 @@ def pytest_runtest_teardown() -> None:
 
 def close_loggers() -> None:
     """Take away the loggers of the test's runs, to which all later runs of this process would write, too."""
-    if (writer := sys.modules.get("nerfstudio.utils.writer")) is not None:
+    writer = sys.modules.get("nerfstudio.utils.writer")
+    if writer is not None:
         for logger in writer.EVENT_WRITERS:
             if hasattr(logger, "tb_writer"):
                 logger.tb_writer.close()  # which has a thread and a file

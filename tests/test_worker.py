@@ -168,9 +168,12 @@ def test_a_function_does_not_outlive_the_command_that_is_killed(program, tmp_pat
         f"Worker('program:function', pathlib.Path({str(log)!r}), saves=True).run(on_event=print)"
     )
     command = subprocess.Popen([sys.executable, "-c", parent])
-    while not (log.exists() and (found := re.search(r"^pid (\d+)$", log.read_text("utf8"), re.MULTILINE))):
+    found = None
+    while found is None:
         assert command.poll() is None
         time.sleep(0.05)
+        if log.exists():
+            found = re.search(r"^pid (\d+)$", log.read_text("utf8"), re.MULTILINE)
     command.kill()
     command.wait()
     end = time.monotonic() + HANGS

@@ -302,7 +302,8 @@ def test_gpus_are_shared_out(tmp_path: Path):
     seen = []
     bench.run_all(some_jobs("abcd"), runner, seen.append, tmp_path / "log", gpus=["0", "1"], jobs_per_gpu=2)
     assert [gpu for _, gpu in runner.started] == ["0", "1", "0", "1"]
-    assert all(r["jobs_per_gpu"] == 2 for r in seen)
+    for r in seen:
+        assert r["jobs_per_gpu"] == 2
 
 
 def test_an_interrupt_ends_the_running_processes(tmp_path: Path):
@@ -449,4 +450,5 @@ def test_other_commands_are_told_and_reached(capsys: pytest.CaptureFixture[str])
         printed = capsys.readouterr().out
         assert printed.startswith(f"usage: python -m benchmarks {arguments[0] if len(arguments) == 2 else '['}")
         if len(arguments) == 1:
-            assert all(f"  {name}: " in printed for name in bench.COMMANDS)
+            for name in bench.COMMANDS:
+                assert f"  {name}: " in printed

@@ -238,8 +238,10 @@ def test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed(rows: l
         assert pair["seeds"] == [0, 1]
         assert 0 <= pair["mean"] <= pair["worst"] < 1
         assert pair["points"] > 100
-        assert all(0 < errors["median"] < errors["mean"] < 2 for errors in row["left_out"])
-        assert all({*stages} == {"features", "matches", "cameras", "adjustment"} for stages in row["seconds"])
+        for errors in row["left_out"]:
+            assert 0 < errors["median"] < errors["mean"] < 2
+        for stages in row["seconds"]:
+            assert {*stages} == {"features", "matches", "cameras", "adjustment"}
         assert row["cores"] >= 1
         assert row["versions"]["pycolmap"] == pycolmap.__version__
     released, squared = rows

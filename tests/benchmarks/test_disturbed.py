@@ -248,7 +248,8 @@ def test_photos_to_cut_out_are_read_only_if_they_are_given(tmp_path: Path, capsy
 def parser_of(label: str, copy: Path, work: Path) -> Any:
     """The parser of a row of the protocol, for a copy in the place of fox."""
     rows = protocol.load(CONFIGS / "disturbed.yaml")
-    (job,) = [job for job in rows.jobs() if (job.scene.name, job.row.label, job.seed) == ("fox", label, 0)]
+    jobs = {(job.scene.name, job.row.label, job.seed): job for job in rows.jobs()}
+    job = jobs["fox", label, 0]
     root = work / "copies"
     root.mkdir()
     (root / "fox").symlink_to(copy)

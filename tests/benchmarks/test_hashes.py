@@ -56,6 +56,10 @@ def test_a_checkpoint_s_plan_and_options_do_not_enter_its_hashes():
         }
         return {"step": 3, "pipeline": pipeline, "optimizers": {"means": {"state": {0: {"exp_avg": torch.ones(1)}}}}}
 
-    one, other = ({name: hash_tensors(v) for name, v in groups_of(checkpoint(o)).items()} for o in ("old", "new"))
+    def hashes_of(option: str) -> dict[str, str]:
+        return {name: hash_tensors(tensors) for name, tensors in groups_of(checkpoint(option)).items()}
+
+    one = hashes_of("old")
+    other = hashes_of("new")
     assert one == other
     assert set(groups_of(checkpoint("old"))["strategy"]) == {"n_total"}

@@ -86,7 +86,10 @@ def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_referen
     actual = table.Run("fox", "no curve", [[*ours, result()]], [THEIRS]).matched()
     assert actual == "–"
     assert table.Run("fox", "no reference here", [ours], [[]]).matched() == "–"
-    without_lpips = [{**run, "curve": [{**point, "lpips": None} for point in run["curve"]]} for run in ours]
+    without_lpips = []
+    for run in ours:
+        curve = [{**point, "lpips": None} for point in run["curve"]]
+        without_lpips.append({**run, "curve": curve})
     assert table.Run("fox", "without LPIPS on its way", [without_lpips], [THEIRS]).matched() == "–"
     theirs = [{name: value for name, value in run.items() if name != "lpips"} for run in THEIRS]
     assert table.Run("fox", "to a reference without LPIPS", [without_lpips], [theirs]).matched() == "1.5"
@@ -163,7 +166,8 @@ def test_wrong_input_is_one_sentence_and_writes_nothing(
 def test_labels_are_told_apart_without_colour():
     looks = list(plots.styles(f"label {i}" for i in range(12)).values())
     assert len({look["marker"] for look in looks}) == 12
-    assert all(a["color"] != b["color"] for a, b in itertools.pairwise(looks))
+    for a, b in itertools.pairwise(looks):
+        assert a["color"] != b["color"]
 
 
 def test_a_label_looks_the_same_in_all_panels_and_in_the_legend():
@@ -233,8 +237,10 @@ def test_names_of_points_stand_inside_beside_their_points_and_apart():
         for number, box in enumerate(boxes):
             assert axes.bbox.containsx(box.x0)
             assert axes.bbox.containsx(box.x1)
-            assert not any(box.contains(*centre) for centre in centres)
-            assert not any(box.overlaps(other) for other in boxes[:number])
+            for centre in centres:
+                assert not box.contains(*centre)
+            for other in boxes[:number]:
+                assert not box.overlaps(other)
             assert np.abs(np.clip(centres[number], box.min, box.max) - centres[number]).max() < 20
     lines = figure.axes[0].lines
     assert [line.get_fillstyle() for line in lines] == ["full", "full", "none", "full"]

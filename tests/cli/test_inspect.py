@@ -116,7 +116,9 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_path: Path):
     written = inspection.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, 8, None)
-    assert all(path.name.startswith("eval-001-") and path.is_file() for path in written)
+    for path in written:
+        assert path.name.startswith("eval-001-")
+        assert path.is_file()
     assert len(written) == 6
 
 
@@ -250,7 +252,8 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
-    assert all(parameter.grad is None for parameter in early.model.parameters())
+    for parameter in early.model.parameters():
+        assert parameter.grad is None
 
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):

@@ -110,7 +110,8 @@ def test_a_transforms_json_becomes_what_nerfstudio_makes_of_it(
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     for data in (tmp_path, tmp_path / "transforms.json"):
         config = NerfstudioDataParserConfig(data=data, **options)
-        found, expected = (parser(config).get_dataparser_outputs(split) for parser in (TransformsParser, Nerfstudio))
+        found = TransformsParser(config).get_dataparser_outputs(split)
+        expected = Nerfstudio(config).get_dataparser_outputs(split)
         expect_the_same(found, expected)
 
 
@@ -119,7 +120,8 @@ def test_a_transforms_json_becomes_what_nerfstudio_makes_of_it(
 def test_a_blender_scene_becomes_what_nerfstudio_makes_of_it(options: dict[str, Any], split: str, tmp_path: Path):
     blender_data(tmp_path, "white")
     config = BlenderDataParserConfig(data=tmp_path, **options)
-    found, expected = (parser(config).get_dataparser_outputs(split) for parser in (BlenderParser, Blender))
+    found = BlenderParser(config).get_dataparser_outputs(split)
+    expected = Blender(config).get_dataparser_outputs(split)
     expect_the_same(found, expected)
 
 

@@ -90,4 +90,5 @@ def test_names_of_files_may_be_texts(tmp_path: Path):
     assert is_finite(trainer.pipeline.model)
     outputs = trainer.pipeline.datamanager.train_dataset._dataparser_outputs
     assert outputs.mask_filenames is not None
-    assert all(isinstance(path, Path) for path in (*outputs.image_filenames, *outputs.mask_filenames))
+    for path in (*outputs.image_filenames, *outputs.mask_filenames):
+        assert isinstance(path, Path)

@@ -112,8 +112,11 @@ def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: i
     rows = [(b.view, row) for b in bands for row in range(b.first, b.last)]
     assert rows == [(view, row) for view in range(views) for row in range(height)]
     if views % ranks == 0:
-        assert all((b.first, b.last, b.top, b.bottom) == (0, height, 0, height) for b in bands)
-    shares = [sum(b.last - b.first for b in bands if b.rank == rank) for rank in range(ranks)]
+        for b in bands:
+            assert (b.first, b.last, b.top, b.bottom) == (0, height, 0, height)
+    shares = [0] * ranks
+    for band in bands:
+        shares[band.rank] += band.last - band.first
     assert max(shares) - min(shares) <= max(2 * ROWS, height if height < ROWS else 0)
 
 

@@ -140,7 +140,8 @@ def test_points_depend_on_no_generator_but_their_own_and_are_no_more_than_asked_
     assert torch.equal(torch.random.get_rng_state(), before)
     assert len(first.means.unique(dim=0)) == 2000
     torch.manual_seed(5)
-    assert all(torch.equal(a, b) for a, b in zip(first, views.draw(seed=1), strict=True))
+    for a, b in zip(first, views.draw(seed=1), strict=True):
+        assert torch.equal(a, b)
     assert not torch.equal(first.means, views.draw(seed=2).means)
     assert 0 < len(views.draw(number=7).means) <= 7
     assert 2000 < len(views.draw(number=10**6).means) < 4 * HEIGHT * WIDTH

@@ -121,14 +121,16 @@ def test_masked_pixels_have_no_depth_and_are_no_evidence():
     marked = [torch.where(mask[..., None], image, images[0]) for image in images]
     maps = depth_maps(marked.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu")
     check(maps, "slanted", viewmats, 0.6)
-    assert not any(depth_map.confidence[~mask].any() or depth_map.depth[~mask].any() for depth_map in maps)
+    for depth_map in maps:
+        assert not (depth_map.confidence[~mask].any() or depth_map.depth[~mask].any())
     broken = [torch.where(mask[..., None], image, torch.nan) for image in images]
     transparent = [torch.cat([image, mask[..., None]], dim=2) for image in images]
     for same in (
         depth_maps(broken.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu"),
         depth_maps(transparent.__getitem__, viewmats, Ks, points, device="cpu"),
     ):
-        assert all(torch.equal(a.depth, b.depth) for a, b in zip(maps, same, strict=True))
+        for a, b in zip(maps, same, strict=True):
+            assert torch.equal(a.depth, b.depth)
 
 
 def test_repeated_calls_give_the_same():

@@ -46,7 +46,8 @@ class Page:
         """The value of an expression as soon as it is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if value := self.run(script):
+            value = self.run(script)
+            if value:
                 return value
             time.sleep(0.5)
         raise TimeoutError(f"never true: {script}")

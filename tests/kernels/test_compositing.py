@@ -200,9 +200,11 @@ def test_places_below_the_image_are_not_drawn_and_nothing_in_sight_is_black():
     for one, other in zip(expected, drawn_by_the_kernel(scene), strict=True):
         assert torch.equal(one, other)
     scene["starts"], scene["ids"], _ = scene["pending"].lists(needed - 1)
-    assert all(not value.any() for value in drawn_by_the_kernel(scene))
+    for value in drawn_by_the_kernel(scene):
+        assert not value.any()
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
-    assert all(not value.any() for value in drawn_by_the_kernel(scene))
+    for value in drawn_by_the_kernel(scene):
+        assert not value.any()
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
@@ -268,7 +270,8 @@ def test_nothing_in_sight_has_gradients_of_zero():
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
     alphas = torch.zeros(1, 18, 21, 1)
     last_ids = torch.zeros(1, 18, 21, dtype=torch.int32)
-    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+    for value in gradients_of(scene, alphas, last_ids).values():
+        assert (value == 0).all()
 
 
 @pytest.mark.parametrize(("num_views", "width", "height"), [(2, 21, 18), (1, 16, 16)])
@@ -293,7 +296,8 @@ def test_lists_that_are_too_short_have_gradients_of_zero():
     scene["starts"], scene["ids"], _ = scene["pending"].lists(len(scene["ids"]) - 1)
     alphas = torch.zeros(2, 18, 21, 1)
     last_ids = torch.zeros(2, 18, 21, dtype=torch.int32)
-    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+    for value in gradients_of(scene, alphas, last_ids).values():
+        assert (value == 0).all()
 
 
 def test_tiles_without_gaussians_stay_out_of_the_others_lists():
@@ -358,7 +362,8 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
     viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
     Ks = small_scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
-    rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
+    rest = 0.1 * torch.randn((60, 15, 3), generator=generator)
+    v_renders = 0.1 * torch.randn((2, height, width, 3), generator=generator)
     results = []
     drawn = []
     for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
@@ -433,7 +438,11 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         gradients: dict[str, Any] = dict(
             zip(NAMES, [*(value.grad for value in inputs), means2d.absgrad], strict=True)
         )  # fmt: skip
-        errors.append({k: float((gradients[k].double().cpu() - v).norm() / v.norm()) for k, v in expected.items()})
+        of_run = {}
+        for name, value in expected.items():
+            difference = gradients[name].double().cpu() - value
+            of_run[name] = float(difference.norm() / value.norm())
+        errors.append(of_run)
     print(kind, *errors)
     stated = {"absgrad": 1e-4}
     if kind == "tiny":

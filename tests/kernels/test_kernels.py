@@ -199,7 +199,8 @@ def test_a_failure_is_told_once_and_tried_again_and_a_success_is_kept(nothing_tr
     outcomes = [RuntimeError("CUDA error: out of memory.\nCompile with …"), RuntimeError("out of memory"), None]
 
     def run_trial(device):
-        if (outcome := outcomes.pop(0)) is not None:
+        outcome = outcomes.pop(0)
+        if outcome is not None:
             raise outcome
 
     monkeypatch.setattr("sadgs_ns.kernels.trial.run_trial", run_trial)
@@ -217,14 +218,16 @@ def test_a_failure_that_lasts_is_tried_at_ever_longer_intervals(nothing_tried, m
     trials = []
     monkeypatch.setattr("sadgs_ns.kernels.trial.run_trial", lambda device: trials.append(device) or 1 / 0)
     with pytest.warns(UserWarning, match=r"\(division by zero\)"):
-        assert not any(kernels._compiles(DEVICE) for _ in range(1000))
+        for _ in range(1000):
+            assert not kernels._compiles(DEVICE)
     assert len(trials) == 10
 
 
 def test_an_old_triton_is_left_alone_and_named(nothing_tried, monkeypatch):
     monkeypatch.setattr("triton.__version__", "3.4.0")
     with pytest.warns(UserWarning, match=r"do not run here: 3\.4\.0 is older than 3\.5 \(torch 2\.9\);") as told:
-        assert not any(kernels._compiles(DEVICE) for _ in range(10))
+        for _ in range(10):
+            assert not kernels._compiles(DEVICE)
     assert len(told) == 1
 
 
@@ -419,7 +422,9 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
 @pytest.mark.parametrize("n", [1, 37, 1024, 2050])
 def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n, used):
     generator = torch.Generator().manual_seed(n)
-    log_scales, logits, weights = (torch.randn(shape, generator=generator) for shape in ((n, 3), (n, 1), (n, 12)))
+    log_scales = torch.randn((n, 3), generator=generator)
+    logits = torch.randn((n, 1), generator=generator)
+    weights = torch.randn((n, 12), generator=generator)
     logits[0] = -12.0
     log_scales[0] = torch.tensor([-9.0, 3.0, 0.0])
     penalty = 0.3 if "penalty" in used else 0.0
@@ -507,7 +512,8 @@ def test_an_update_of_a_step_that_overflowed_changes_nothing(flags):
     gradients = tuple(torch.ones_like(p) for p in parameters[0])
     adam.adam_step(parameters[0], gradients, *parameters[1:], factors([1] * 5, LRS), noted, overflowed, **OURS)
     for values, start in zip(parameters, (1, 0, 0), strict=True):
-        assert all(bool((value == start).all()) != drawn for value in values)
+        for value in values:
+            assert bool((value == start).all()) != drawn
 
 
 def test_adam_counts_each_parameters_own_updates():
@@ -666,8 +672,11 @@ def test_a_gaussian_that_is_listed_in_parts_is_listed_as_by_one_lane(monkeypatch
         monkeypatch.setattr(tiles, "_PART_PAIRS", part)
         monkeypatch.setattr(tiles, "_PROGRAMS", programs)
         found.append(tiles.intersect_tiles(**gaussians, width=320, height=240, tile_size=8).lists())
-    assert all(torch.equal(one, other) for lists in found[1:] for one, other in zip(found[0], lists, strict=True))
-    assert all((found[0][1] == g).sum() == 40 * 30 for g in (1, 61))
+    for lists in found[1:]:
+        for one, other in zip(found[0], lists, strict=True):
+            assert torch.equal(one, other)
+    for g in (1, 61):
+        assert (found[0][1] == g).sum() == 40 * 30
     assert len(found[0][1]) > 2 * 40 * 30 + 500
 
 
@@ -704,8 +713,8 @@ def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(
     exact = pending.lists()
     num_pairs = len(exact[1])
     counts = pending.pair_counts
-    expected = [sum(view * 120 <= g < view * 120 + 120 for g in exact[1].tolist()) for view in range(num_views)]
-    assert counts.wait() == expected
+    views = exact[1].cpu() // 120  # Each view has 120 Gaussians.
+    assert counts.wait() == torch.bincount(views, minlength=num_views).tolist()
     assert counts.ready()
     assert sum(counts.wait()) == num_pairs > 500
     for capacity in (num_pairs, num_pairs + 1, 2 * num_pairs):

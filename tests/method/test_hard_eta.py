@@ -86,12 +86,14 @@ def observed(params: dict[str, torch.nn.Parameter], info: dict[str, Any], rounds
         with triton_switched(fused), np.errstate(all="ignore"):
             for seed in range(rounds):
                 generator = torch.Generator(DEVICE).manual_seed(seed)
-                observe(
-                    state,
-                    {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()},
-                    {k: v.detach().to(DEVICE) if isinstance(v, Tensor) else v for k, v in info.items()},
-                    torch.rand(info["means2d"].shape, generator=generator, device=DEVICE),
-                )
+                copies = {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()}
+                on_device = {}
+                for name, value in info.items():
+                    if isinstance(value, Tensor):
+                        value = value.detach().to(DEVICE)
+                    on_device[name] = value
+                gradients = torch.rand(info["means2d"].shape, generator=generator, device=DEVICE)
+                observe(state, copies, on_device, gradients)
         assert all(value.isfinite().all() for value in state.values()), f"fused={fused}"
         results.append({name: value.cpu() for name, value in state.items()})
     slow, fast = results
@@ -178,7 +180,9 @@ def test_log_scales_from_minus_30_to_30(focal: float):
     viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=focal)
     renders, alphas, _ = small_scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
     (renders.sum() + alphas.sum()).backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.grad is not None
+        assert p.grad.isfinite().all()
 
 
 @pytest.mark.hard_case("projected axes of 10⁻²² to 10¹⁹ px", "η is right: it squares no length")
@@ -292,10 +296,11 @@ def test_singular_conics(conic: tuple[float, float, float], counts: bool):
 def test_unnormalised_quaternions_are_the_rotation_that_they_point_at(length: float):
     quat = torch.tensor([0.5, 0.1, 0.7, -0.3])
     scales = (-1.0, -2.0, -3.0)
-    unit, scaled = (
-        parameters([((0.1, 0.2, 4), scales, tuple((factor * quat / quat.norm()).tolist()))]) for factor in (1.0, length)
-    )
-    expected, actual = (observed(params, forward(params, 60.0)) for params in (unit, scaled))
+    unit_quat = quat / quat.norm()
+    unit = parameters([((0.1, 0.2, 4), scales, tuple(unit_quat.tolist()))])
+    scaled = parameters([((0.1, 0.2, 4), scales, tuple((length * quat / quat.norm()).tolist()))])
+    expected = observed(unit, forward(unit, 60.0))
+    actual = observed(scaled, forward(scaled, 60.0))
     torch.testing.assert_close(actual["eta_max"], expected["eta_max"], rtol=1e-4, atol=1e-5)
 
 
@@ -303,8 +308,10 @@ def test_unnormalised_quaternions_are_the_rotation_that_they_point_at(length: fl
 @pytest.mark.parametrize("quat", [(0.0, 0.0, 0.0, 0.0), (1e-20, 0.0, 1e-20, 0.0), (1e25, 1e25, 0.0, 0.0)])
 def test_quaternions_without_direction_are_the_identity(quat: tuple[float, float, float, float]):
     """Zero, or of a length that float32 cannot square."""
-    plain, broken = (parameters([((0.1, 0.2, 4), (-1, -2, -3), q)]) for q in (IDENTITY, quat))
-    expected, actual = (observed(params, forward(params, 60.0)) for params in (plain, broken))
+    plain = parameters([((0.1, 0.2, 4), (-1, -2, -3), IDENTITY)])
+    broken = parameters([((0.1, 0.2, 4), (-1, -2, -3), quat)])
+    expected = observed(plain, forward(plain, 60.0))
+    actual = observed(broken, forward(broken, 60.0))
     torch.testing.assert_close(actual["eta_max"], expected["eta_max"], rtol=1e-4, atol=1e-5)
 
 

@@ -106,7 +106,8 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
     cap = 50 + math.ceil((3 * 511 + 100) / growth_share(10 / 24))  # This step may use so much of it.
     short(max_gaussians=cap).for_run(3000).densify(params, adam(params, lr=0.0), state, 9, [])
     assert len(params["means"]) == 50 + 3 * 511, "three parents of 8³ children fit, a fourth does not"
-    assert all(p.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.isfinite().all()
     actual = params["scales"][47:].amin()
     expected = before["scales"][:3].amin() - math.log(8 / 1.5)
     torch.testing.assert_close(actual, expected)
@@ -171,7 +172,8 @@ def test_a_cap_under_the_initial_number_stops_growth_only():
     start = params["means"].detach().clone()
     assert train(short(max_gaussians=20), params) == [30] * 22
     assert not torch.equal(params["means"], start)
-    assert all(p.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.isfinite().all()
 
 
 @pytest.mark.hard_case("a cap of 0", "refused: `strategy.max_gaussians must be at least 1, got 0.`")
@@ -247,7 +249,8 @@ def test_what_is_kept_of_each_new_gaussian_is_counted():
     grown = len(params["means"]) - 50
     assert grown == 50 * 7
     size = StepSize(views=1)
-    at_first, later = (max(step_memory.step_bytes(n, size, CPU).values()) for n in (50, 50 + grown))
+    at_first = max(step_memory.step_bytes(50, size, CPU).values())
+    later = max(step_memory.step_bytes(50 + grown, size, CPU).values())
     pairs = step_memory.PAIRS_PER_GAUSSIAN * grown * step_memory.PAIR_SORT_BYTES
     widest = 16  # quaternions
     lists = step_memory.step_bytes(50 + grown, size, CPU)["tile lists"] + pairs
@@ -285,7 +288,8 @@ def test_a_split_that_would_not_fit_in_memory_is_reduced_with_a_warning_and_trai
     assert actual == [(1, WIDTH * HEIGHT)]
     assert asked[0].pairs > 0
     assert len(told) == 1
-    assert all(p.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.isfinite().all()
 
 
 @pytest.mark.hard_case("growth by AbsGS that would not fit in memory", "fewer are added, with a warning")
@@ -314,7 +318,8 @@ def test_one_gaussian_trains_and_splits():
     params["scales"].data.fill_(0.0)
     numbers = train(short(tau_split=0.3), params)
     assert numbers[0] == 1 < numbers[-1]
-    assert all(p.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.isfinite().all()
 
 
 @pytest.mark.hard_case("pruning that leaves one Gaussian", "training goes on")
@@ -334,7 +339,8 @@ def test_a_prune_that_would_leave_none_is_left_out(monkeypatch: pytest.MonkeyPat
     params["opacities"].data.fill_(-9.0)
     numbers = train(short(min_opacity=0.5, clone_grad2d=math.inf), params, steps=26)
     assert numbers == [6] * 26
-    assert all(p.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.isfinite().all()
 
 
 @pytest.mark.hard_case(
@@ -399,7 +405,8 @@ def test_few_duplicate_and_collinear_points_start_and_train(name: str):
     model.plan = SimpleNamespace(near_plane=NEAR_PLANE, max_off_axis=config.max_off_axis)  # type: ignore[assignment]
     params = model.gauss_params
     assert len(params["means"]) >= len(points)
-    assert all(bool(p.isfinite().all()) for p in params.values())
+    for p in params.values():
+        assert bool(p.isfinite().all())
     optimizers = {key: FusedAdam([p], lr=0.01) for key, p in params.items()}
     model.train()
     viewmats, Ks = camera(WIDTH, HEIGHT, focal=30.0)
@@ -470,7 +477,8 @@ def test_a_gradient_just_under_the_bound_keeps_adam_finite():
     optimizer = FusedAdam([parameter], lr=0.01, eps=1e-15)
     parameter.grad = torch.tensor([0.99 * nonfinite.MAX_GRADIENT, -0.99 * nonfinite.MAX_GRADIENT])
     optimizer.step()
-    assert all(value.isfinite().all() for value in optimizer.state[parameter].values())
+    for value in optimizer.state[parameter].values():
+        assert value.isfinite().all()
     expected = torch.tensor([-0.01, 0.01])
     torch.testing.assert_close(parameter.detach(), expected)
 
@@ -628,7 +636,8 @@ def test_an_image_that_makes_nan_is_named_and_does_not_poison_the_model(
     assert pipeline.model.num_points > before
     for optimizer in trainer.optimizers.optimizers.values():
         for slots in optimizer.state.values():
-            assert all(value.isfinite().all() for value in slots.values())
+            for value in slots.values():
+                assert value.isfinite().all()
 
 
 @pytest.mark.hard_case("many iterations with NaN", "the first five of every hundred are named, the rest counted")

@@ -75,7 +75,8 @@ def train(
         counts.append(len(params["means"]))
         assert counts[-1] <= options.max_gaussians
         assert all(len(value) == counts[-1] for value in state.values() if isinstance(value, torch.Tensor))
-        assert all(p.isfinite().all() for p in params.values())
+        for p in params.values():
+            assert p.isfinite().all()
     return params, state, counts
 
 
@@ -150,7 +151,9 @@ def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypa
     _, state, counts = train(short(max_gaussians=3000, **growing), 24)
     assert counts[9] > 5 * counts[8], "split in a structure step, and pruned in another"
     assert counts[23] < counts[22], "split in a structure step, and pruned in another"
-    eta_sum, eta_max, n_total = (state[name] for name in ("eta_sum", "eta_max", "n_total"))
+    eta_sum = state["eta_sum"]
+    eta_max = state["eta_max"]
+    n_total = state["n_total"]
     assert (n_total > 1).any(), "clones and children of the last step"
     assert (n_total == 0).any(), "clones and children of the last step"
     assert (eta_max * (1 - 1e-5) <= eta_sum).all()
@@ -267,7 +270,8 @@ def test_windows_follow_the_length_of_the_run_but_for_those_that_are_given():
 def test_a_run_too_short_to_densify_prepares_nothing_for_it():
     strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
     strategy = strategy.for_run(700)  # 443 would be before 500
-    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
+    for step in range(700):
+        assert not (strategy.observes(step) or strategy.needs_absgrad(step))
     assert strategy.windows.refine_stop_iter == 0
 
 
@@ -287,9 +291,11 @@ def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
     expected = set(range(1, 401)) | set(range(501, 901)) | set(range(1001, 1401)) | set(range(1501, 1601))
     assert needed == expected
     strategy.structure_every = 0
-    assert all(strategy.needs_absgrad(step) == (step < 1600) for step in range(3000))
+    for step in range(3000):
+        assert strategy.needs_absgrad(step) == (step < 1600)
     strategy.absgs_every = 0
-    assert not any(strategy.needs_absgrad(step) for step in range(3000))
+    for step in range(3000):
+        assert not strategy.needs_absgrad(step)
 
 
 def test_keeping_all_gradients_changes_nothing(monkeypatch: pytest.MonkeyPatch):

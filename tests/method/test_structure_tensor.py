@@ -47,7 +47,8 @@ def reference_structure_tensor(
 
     def blur(values, sigma, order=""):  # scipy's taps: truncated where ours are
         radius = math.ceil(3 * sigma)
-        taps_0, taps_1 = (gaussian_kernel(sigma, o, torch.float64).numpy() for o in (0, 1))
+        taps_0 = gaussian_kernel(sigma, 0, torch.float64).numpy()
+        taps_1 = gaussian_kernel(sigma, 1, torch.float64).numpy()
         assert len(taps_0) == 2 * radius + 1
         along_x = taps_1 if order == "x" else taps_0
         along_y = taps_1 if order == "y" else taps_0
@@ -59,7 +60,9 @@ def reference_structure_tensor(
         smoothed = blur(array, sigma)
         g_x = blur(array, sigma, "x")
         g_y = blur(array, sigma, "y")
-        xx, xy, yy = (blur(p.sum(-1), 3 * sigma) for p in (g_x * g_x, g_x * g_y, g_y * g_y))
+        xx = blur((g_x * g_x).sum(-1), 3 * sigma)
+        xy = blur((g_x * g_y).sum(-1), 3 * sigma)
+        yy = blur((g_y * g_y).sum(-1), 3 * sigma)
         energy = blur(((previous - smoothed) ** 2).sum(-1), energy_blur * sigma) ** (gamma / 2)
         scale = energy / sigma**2 / (xx + yy + ((noise / sigma) ** 2 if epsilon is None else epsilon))
         numerator = numerator + torch.stack([torch.from_numpy(scale * s) for s in (xx, xy, yy)], -1)

@@ -94,7 +94,8 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
         images = opened.read_all_images()
         assert {image.name for image in images} == set(names)
         assert len({image.camera_id for image in images}) == 1  # The photos of a group share one.
-        assert all(opened.num_keypoints_for_image(image.image_id) > 0 for image in images)
+        for image in images:
+            assert opened.num_keypoints_for_image(image.image_id) > 0
 
 
 def test_no_more_photos_are_searched_at_a_time_than_memory_holds(features, monkeypatch):
@@ -126,7 +127,8 @@ def test_photos_are_taken_by_lots_as_all_at_once(features, tmp_path: Path, monke
         features.extract(tmp_path, [names[:4], names[4:]], database, [views])
         with pycolmap.Database.open(database) as opened:
             images = {image.name: image for image in opened.read_all_images()}
-            cameras = [[images[name].camera_id for name in group] for group in (names[:4], names[4:])]
+            cameras = [images[name].camera_id for name in names]
+            cameras = [cameras[:4], cameras[4:]]
             assert len({*cameras[0]}) == 1
             assert len({*cameras[0], *cameras[1]}) == 2
             rigs = [rig.num_sensors() for rig in opened.read_all_rigs()]

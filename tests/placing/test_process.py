@@ -245,7 +245,8 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     monkeypatch.setattr(reconstruct, "is_firm", lambda model: True)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
-    (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
+    made = pycolmap.Reconstruction(tmp_path / "model")
+    (camera,) = made.cameras.values()
     assert angles == [8, 4]
     assert made.num_reg_images() == VIEWS
     assert camera.focal_length_x == pytest.approx(camera.focal_length_y, rel=0.05)
@@ -385,9 +386,10 @@ OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pyte
 def test_nerfstudio_reads_the_scene_without_options(run: Run, open3d: None):
     parsed = NerfstudioDataParserConfig(data=run.out, load_3D_points=True).setup().get_dataparser_outputs("train")
     assert 0 < len(parsed.image_filenames) < VIEWS
-    assert all(path.exists() for path in parsed.image_filenames)
-    actual = len({(int(w), int(h)) for w, h in zip(parsed.cameras.width, parsed.cameras.height, strict=True)})
-    assert actual == 1
+    for path in parsed.image_filenames:
+        assert path.exists()
+    sizes = torch.cat([parsed.cameras.width, parsed.cameras.height], dim=-1)
+    assert len(sizes.unique(dim=0)) == 1
     assert parsed.cameras.distortion_params is None or not parsed.cameras.distortion_params.any()
     assert len(parsed.metadata["points3D_xyz"]) > 200
 
@@ -555,7 +557,8 @@ def test_photos_that_are_not_read_are_told_beside_those_that_are(
     (folder / "notes.txt").write_text("no image")
     registered(9)
     assert main([str(folder), str(tmp_path / "out")]) == 0
-    assert "9 of 12 photos registered" in (printed := capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert "9 of 12 photos registered" in printed
     assert "as images that are not read (make them .jpg or .png files): 8, such as IMG_0.HEIC.\n" in printed
 
 
@@ -756,9 +759,9 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
     for name in (frame["file_path"] for frame in described["frames"]):
         with Image.open(tmp_path / "out" / name) as image:
             assert image.getexif().get(0x112, 1) == 1
-            actual, expected = (
-                np.ravel(np.asarray(shown.convert("L").resize((32, 24)))) for shown in (image, drawn[int(name[-6:-4])])
-            )
+            photo = drawn[int(name[-6:-4])]
+            actual = np.ravel(np.asarray(image.convert("L").resize((32, 24))))
+            expected = np.ravel(np.asarray(photo.convert("L").resize((32, 24))))
         assert np.corrcoef(actual, expected)[0, 1] > 0.9
         with Image.open(tmp_path / "out" / "masks" / f"{Path(name).name}.png") as mask:
             columns = np.asarray(mask)
@@ -1385,7 +1388,9 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "out" / "work").mkdir(parents=True)
     (tmp_path / "out" / "work" / "settings.json").write_text('{"source": ')
     assert main([str(photos), str(tmp_path / "out")]) == 2
-    assert "settings.json is damaged (" in (printed := capsys.readouterr().err) and printed.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "settings.json is damaged (" in printed
+    assert printed.count("\n") == 1
 
 
 def imported_by(statement: str) -> set[str]:
@@ -1637,7 +1642,8 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     runs: list[list[str]] = []
 
     def stop(colmap: Worker, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
-        assert all((photos / name).is_file() for name in itertools.chain(*groups))
+        for name in itertools.chain(*groups):
+            assert (photos / name).is_file()
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
@@ -1778,7 +1784,8 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     described = json.loads((out / "transforms.json").read_text())
     frames = {frame["file_path"]: frame for frame in described["frames"]}
     assert len(frames) == VIEWS
-    assert all(frames[frame["file_path"]] == frame for frame in before["frames"])
+    for frame in before["frames"]:
+        assert frames[frame["file_path"]] == frame
     assert described | {"frames": before["frames"]} == before
     new = pycolmap.Reconstruction(out / "work" / "model-10")
     for identity, image in old.images.items():

@@ -66,7 +66,8 @@ def test_views_that_are_rendered_together_add_up_and_one_unknown_makes_all_wait(
     forecast = TileForecast()
     render(forecast, [0, 1], [1_000_000, 3_000_000])
     assert forecast.capacity([0, 2], SIZE, 100) is None
-    both, one = (forecast.capacity(views, SIZE, 100) for views in ([1, 0], [1]))
+    both = forecast.capacity([1, 0], SIZE, 100)
+    one = forecast.capacity([1], SIZE, 100)
     assert both is not None
     assert one is not None
     assert both == pytest.approx(MARGIN * 4_000_000, rel=1 / 15)

@@ -127,13 +127,13 @@ def model(config: SadgsModelConfig) -> SadgsModel:
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
 def test_every_public_field_is_followed_by_a_docstring(cls: type):
     body = body_of(cls)
-    undocumented = [
-        ast.unparse(statement.target)
-        for statement, following in zip(body, [*body[1:], ast.Pass()], strict=True)
-        if isinstance(statement, ast.AnnAssign)
-        and not ast.unparse(statement.target).startswith("_")
-        and not is_string(following)
-    ]
+    undocumented = []
+    for statement, following in zip(body, [*body[1:], ast.Pass()], strict=True):
+        if not isinstance(statement, ast.AnnAssign):
+            continue
+        name = ast.unparse(statement.target)
+        if not name.startswith("_") and not is_string(following):
+            undocumented.append(name)
     assert is_string(body[0])
     assert undocumented == []
 
@@ -279,7 +279,9 @@ def test_options_that_the_help_hides_and_that_cannot_work_say_why(words: str, se
 def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
     texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
     assert texts
-    assert not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+    for text in texts:
+        for line in text.strip().splitlines():
+            assert line.endswith("."), text
 
 
 def test_small_images_bound_the_number_of_starting_points(capsys: pytest.CaptureFixture[str]):
@@ -352,7 +354,8 @@ def test_options_of_the_pipeline_that_are_out_of_range_are_refused(option: str, 
 
 def test_gaussians_are_neither_added_nor_removed_where_densification_ends_at_0():
     strategy = StructureAwareStrategy(refine_stop_iter=0).for_run(3000)
-    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(3000))
+    for step in range(3000):
+        assert not (strategy.observes(step) or strategy.needs_absgrad(step))
 
 
 def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):

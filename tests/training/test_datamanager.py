@@ -295,9 +295,8 @@ def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDat
     points = [each.metadata["points3D_xyz"] for each in outputs]
     torch.testing.assert_close(points[1], points[0], atol=1e-5, rtol=0)
     maps = [Similarity.of(each.dataparser_scale * each.dataparser_transform.double().numpy()) for each in outputs]
-    there, here = (
-        similarity.inverse().positions(found.double().numpy()) for similarity, found in zip(maps, points, strict=True)
-    )
+    there = maps[0].inverse().positions(points[0].double().numpy())
+    here = maps[1].inverse().positions(points[1].double().numpy())
     np.testing.assert_allclose(here - by, there, atol=1e-4)
 
 
@@ -435,7 +434,8 @@ def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp
     rows = [(*place, *color, other(i)) for i, (place, color) in enumerate(zip(POSITIONS, COLORS, strict=True))]
     vertices = np.array(rows, fields)
     faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
-    before, after = (PlyElement.describe(faces, name) for name in ("face", "edge"))
+    before = PlyElement.describe(faces, "face")
+    after = PlyElement.describe(faces, "edge")
     points = PlyElement.describe(vertices, "vertex", len_types={"track": "u1"}, val_types={"track": "i4"})
     whole = PlyData([before, points, after], text=order == "text", byte_order="<" if order == "text" else order)
     whole.write(str(tmp_path / "a.ply"))

@@ -156,7 +156,8 @@ def test_an_iteration_takes_no_more_views_than_there_are(
     monkeypatch.setattr(ViewSampler, "draw", lambda *args: seen.append(draw(*args)) or seen[-1])
     assert train(config).pipeline.model.plan.views_per_iteration == TRAIN_VIEWS
     assert len(seen) == 3, "a round each"
-    assert all(sorted(drawn) == list(range(TRAIN_VIEWS)) for drawn in seen), "a round each"
+    for drawn in seen:
+        assert sorted(drawn) == list(range(TRAIN_VIEWS)), "a round each"
 
 
 def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -175,10 +176,11 @@ def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserCo
         if trainer.step in (0, ITERATIONS - 1):
             with torch.no_grad():
                 trainer.pipeline.eval()
-                metrics = [
-                    trainer.pipeline.model.get_metrics_dict(trainer.pipeline.model.get_outputs(camera), batch)["psnr"]
-                    for camera, batch in (trainer.pipeline.datamanager.next_train(0) for _ in range(TRAIN_VIEWS))
-                ]
+                model = trainer.pipeline.model
+                metrics = []
+                for _ in range(TRAIN_VIEWS):
+                    camera, batch = trainer.pipeline.datamanager.next_train(0)
+                    metrics.append(model.get_metrics_dict(model.get_outputs(camera), batch)["psnr"])
             psnr.append(float(sum(metrics)) / TRAIN_VIEWS)
 
     train(config, measure)
@@ -226,12 +228,12 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
         return config
 
     iterates: list[dict[str, torch.Tensor]] = []
-    train(
-        configured("last", 0.0),
-        lambda trainer: iterates.append(
-            {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
-        ),
-    )
+
+    def keep(trainer: SadgsTrainer) -> None:
+        params = trainer.pipeline.model.gauss_params
+        iterates.append({name: value.detach().clone() for name, value in params.items()})
+
+    train(configured("last", 0.0), keep)
     config = configured("whole", averaged / iterations)
     config.steps_per_save = stop
     config.save_only_latest_checkpoint = False
@@ -735,8 +737,10 @@ def test_after_the_viewer_has_rendered_the_whole_model_trains_again(trained: Sad
     pipeline.train()
     pipeline.model.eval()  # as nerfstudio's viewer does
     assert pipeline.train() is pipeline
-    assert all(module.training for module in pipeline.modules())
-    assert not any(module.training for module in pipeline.eval().modules())
+    for module in pipeline.modules():
+        assert module.training
+    for module in pipeline.eval().modules():
+        assert not module.training
 
 
 def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):

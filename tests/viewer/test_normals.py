@@ -94,7 +94,8 @@ def test_what_is_read_later_is_computed_once_and_only_then():
     assert not calls
     assert torch.equal(outputs["normals"], torch.ones(2))
     assert outputs.get("normals") is outputs["normals"]
-    assert all(isinstance(value, torch.Tensor) for value in outputs.values())
+    for value in outputs.values():
+        assert isinstance(value, torch.Tensor)
     assert calls == ["normals"]
 
 

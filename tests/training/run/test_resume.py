@@ -152,7 +152,8 @@ def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_
     config.save_only_latest_checkpoint = False
     trainer = set_up(config)
     with monkeypatch.context() as patched:
-        (clock := Clock()).attach(trainer, patched)
+        clock = Clock()
+        clock.attach(trainer, patched)
         trainer.train()
     # Due after 60 s, and then after 200 s, since a checkpoint takes 2 s.
     assert clock.saved == [2, 10, ITERATIONS - 1]
@@ -190,7 +191,8 @@ def test_the_clock_gives_way_to_steps_and_makes_nothing_in_a_short_run(
     for name, value in settings.items():
         setattr(config, name, value)
     trainer = set_up(config)
-    (clock := Clock()).attach(trainer, monkeypatch, seconds)
+    clock = Clock()
+    clock.attach(trainer, monkeypatch, seconds)
     trainer.train()
     assert clock.saved == saved
 

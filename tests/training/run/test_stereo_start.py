@@ -52,7 +52,10 @@ def test_points_near_the_surfaces_are_added_to_the_initial_ones_whatever_the_see
     assert shares.max() < 1 + 1e-4, "only short wavelengths make points smaller"
     data = started.datamanager.train_dataparser_outputs
     rng = np.random.default_rng(0)
-    samples = [(points := surface.sample(5000, rng), surface.colour(points)) for surface in room_surfaces()]
+    samples = []
+    for surface in room_surfaces():
+        points = surface.sample(5000, rng)
+        samples.append((points, surface.colour(points)))
     positions, colors = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     drawn = points_in_the_run(positions, colors, data.dataparser_transform, data.dataparser_scale)
     distances, nearest = torch.cdist(added["means"], drawn["points3D_xyz"].double()).min(dim=1)

@@ -113,7 +113,8 @@ def test_nothing_changes_at_the_start():
 def test_a_gain_in_linear_light_is_an_affine_map_of_srgb_but_for_the_darkest():
     light = torch.linspace(0.0031308, 0.25, 100)  # Twice and four times as much of it is neither dark nor saturated.
     for gain in (2.0, 4.0):
-        bright, dark = (1.055 * value ** (1 / 2.4) - 0.055 for value in (gain * light, light))
+        bright = 1.055 * (gain * light) ** (1 / 2.4) - 0.055
+        dark = 1.055 * light ** (1 / 2.4) - 0.055
         factor = gain ** (1 / 2.4)
         expected = factor * dark + 0.055 * (factor - 1)
         torch.testing.assert_close(bright, expected, atol=1e-6, rtol=0)

@@ -411,7 +411,10 @@ def test_a_gpu_trains_alike_with_graphs(
     assert replayed.graphed.failure == ""
     assert replayed.graphed.replayed > 150, f"of 300 steps {replayed.graphed.replayed} were replayed"
     assert expected[:100:2] == found[:100:2], "the same views come in the same order"
-    losses = [torch.stack([loss for loss, *_ in trace[1::2]]).cpu() for trace in (expected, found)]
+    losses = []
+    for trace in (expected, found):
+        of_steps = [loss for loss, *_ in trace[1::2]]
+        losses.append(torch.stack(of_steps).cpu())
     actual = losses[1][:50]
     torch.testing.assert_close(actual, losses[0][:50], rtol=1e-3, atol=0)
     for step, tolerance in ((119, 0.02), (299, 0.1)):  # At 120 one more Gaussian that is split has dozens of children.

@@ -144,8 +144,10 @@ def test_the_darker_half_of_a_mask_s_values_is_hidden(
         else:
             Image.fromarray(values.astype(np.uint16 if mode == "I;16" else np.uint8)).save(path)
     found = [data["mask"] for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train]
-    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
-    assert all(0 < mask.float().mean() < 1 for mask in expected)
+    for pair in zip(found, expected, strict=True):
+        assert torch.equal(*pair)
+    for mask in expected:
+        assert 0 < mask.float().mean() < 1
 
 
 def test_hidden_pixels_get_the_parser_s_colour(tmp_path: Path):
@@ -272,7 +274,8 @@ def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tm
         observed = observe_training_views(trainer.pipeline.structure_cache)
         seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.camera[1], *observed.values()])
     for tensors in zip(*seen, strict=True):
-        assert all(torch.equal(tensor, tensors[0]) for tensor in tensors)
+        for tensor in tensors:
+            assert torch.equal(tensor, tensors[0])
     assert sums[0] == sums[1] == sums[2]
     expected = states[0]
     for state in states[1:]:

@@ -156,7 +156,8 @@ def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: in
     visits: Counter[int] = Counter()
     lost: dict[int, list[int]] = {}
     for step in range(STEPS):
-        sampler.requeue(back := lost.pop(step - 3, []))
+        back = lost.pop(step - 3, [])
+        sampler.requeue(back)
         following = sampler.foresee(number, foreseen)
         drawn = sampler.draw(number)
         assert following[:1] in ([], [drawn])
