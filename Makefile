@@ -1,5 +1,6 @@
-# From a bare checkout with Python 3.10-3.13, a C compiler and make: `make demo`, `make test`, `make gate`, `make lint`,
-# and `make test-portable`, the tests of the method and the splatter as a plainer processor rounds.
+# From a bare checkout with Python 3.10-3.13, a C compiler and make: `make demo`, `make test`, `make test-slow` (what
+# `make test` leaves out), `make gate`, `make lint`, and `make test-portable`, the tests of the method and the splatter
+# as a plainer processor rounds.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -10,7 +11,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-portable gate lint docs clean
+.PHONY: demo test test-slow test-portable gate lint docs clean
 
 demo: $(STAMP)
 	$(BIN)/python -m examples.drawn_scene
@@ -27,6 +28,10 @@ turn: $(STAMP)
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+# Tests of rare cases, and of whole commands in processes of their own, which `test` leaves out.
+test-slow: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
 
 # ATEN_CPU_CAPABILITY=default keeps torch from its AVX2 and AVX-512 kernels, which round differently. A test that
 # fails in only one of `test` and `test-portable` depends on the processor.
