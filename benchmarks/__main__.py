@@ -37,6 +37,7 @@ COMMANDS = {
     "seconds": ("seconds:Command", "what a user waits for: the parts of a command side by side"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
+    "evidence": ("moved:Command", "pictures of what a run finds to have moved, and why"),
     "disturbed": ("disturbed:Command", "copies of scenes in which things stand before some photos, and their masks"),
 }
 """What is done besides running a protocol, and the class that does it."""
