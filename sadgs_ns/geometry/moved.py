@@ -45,7 +45,7 @@ SMALLEST_SHARE = 0.003
 DILATION = 2
 """Pixels by which regions are dilated, as edges are blurred and things throw contact shadows."""
 _SAMPLES = 200_000  # Pixels of all views of which median and spread are taken
-_POINTS = 2000  # Points on surfaces that tell which views see the same things
+_POINTS = 1000  # Points on surfaces that tell which views see the same things
 _FEWEST_PIXELS = 4  # Of a region in the smallest photos
 _CROSS = ndimage.generate_binary_structure(2, 1)  # A pixel and the four beside it
 _TINY = 1e-6
@@ -103,13 +103,9 @@ def difference(
     photo = _smoothed(photo, weight, 3)
     drawn = _smoothed(drawn, weight, 3)
     height, width = valid.shape
-    padded = F.pad(drawn[None], (SHIFT, SHIFT, SHIFT, SHIFT), mode="replicate")[0]
-    least = torch.full_like(photo[0], math.inf)
-    for dy in range(2 * SHIFT + 1):
-        for dx in range(2 * SHIFT + 1):
-            shifted = padded[:, dy : dy + height, dx : dx + width]
-            distance = (photo - shifted).square().mean(dim=0).sqrt()
-            least = torch.minimum(least, distance)
+    padded = F.pad(drawn[None], (SHIFT, SHIFT, SHIFT, SHIFT), mode="replicate")
+    shifted = F.unfold(padded, 2 * SHIFT + 1).view(3, -1, height, width)
+    least = (photo[:, None] - shifted).square().mean(dim=0).amin(dim=0).sqrt()  # [h, w]
     return _smoothed(least[None], weight, WINDOW)[0] * weight[0]
 
 
@@ -126,7 +122,7 @@ def _smoothed(
 
 def surface_points(views: Sequence[SmallView]) -> Tensor:
     """Return points of what the views draw, evenly over views and pixels, in world space. float64 [P, 3]"""
-    of_each = max(_POINTS // len(views), 4)
+    of_each = max(_POINTS // len(views), 2)
     points = []
     for view in views:
         pixels = view.depth.numel()
@@ -153,7 +149,7 @@ def excess(view: SmallView, others: Sequence[SmallView]) -> Tensor:
     unknown = torch.full_like(view.difference, math.nan)
     if len(others) < FEWEST_SEEING:
         return unknown
-    told = torch.stack([_carried(view, other) for other in others])  # NaN where one tells nothing. [N, h, w]
+    told = _carried(view, others)  # NaN where one tells nothing. [N, h, w]
     enough = told.isfinite().sum(dim=0) >= FEWEST_SEEING
     enough &= view.valid
     return torch.where(enough, view.difference - _upper(told), unknown)
@@ -170,33 +166,47 @@ def _upper(
     return ordered.gather(0, rank[None])[0]
 
 
-def _carried(view: SmallView, other: SmallView) -> Tensor:
-    """Return the differences of another view at the points of a view, NaN where it tells nothing. [h, w]"""
+def _carried(view: SmallView, others: Sequence[SmallView]) -> Tensor:
+    """Return the differences of other views at the points of a view, NaN where they tell nothing. [N, h, w]"""
     height, width = view.depth.shape
     device = view.depth.device
     x = torch.arange(width, device=device) + 0.5
     y = torch.arange(height, device=device)[:, None] + 0.5
-    to = (other.viewmat.double() @ view.viewmat.double().inverse()).float()
     ray_x = (x - view.K[0, 2]) / view.K[0, 0]
     ray_y = (y - view.K[1, 2]) / view.K[1, 1]
+    viewmats = torch.stack([other.viewmat for other in others]).double()
+    Ks = torch.stack([other.K for other in others])
+    to = (viewmats @ view.viewmat.double().inverse()).float()[:, :3, :, None, None]  # [N, 3, 4, 1, 1]
     # No matrix product, since TF32 would round it to 10 bits.
-    rows = to[:3, :, None, None]
-    turned = rows[:, 0] * ray_x + rows[:, 1] * ray_y + rows[:, 2]  # [3, h, w]
-    point = turned * view.depth + rows[:, 3]
-    depth = point[2].clamp_min(_TINY)
-    other_height, other_width = other.depth.shape
-    u = (other.K[0, 0] * point[0] / depth + other.K[0, 2]) * (2 / other_width) - 1
-    v = (other.K[1, 1] * point[1] / depth + other.K[1, 2]) * (2 / other_height) - 1
-    grid = torch.stack([u, v], dim=-1)[None]  # [1, h, w, 2]
-    # The greatest difference near the place counts, since depth is not exact.
-    near = F.max_pool2d(other.difference[None], WINDOW, 1, WINDOW // 2)
-    stacked = torch.stack([near[0], other.depth, other.valid.to(near)])[None]
-    found = F.grid_sample(stacked, grid, mode="nearest", align_corners=False)[0]
-    sees = (point[2] > 0) & (view.depth > 0) & (u.abs() < 1) & (v.abs() < 1)
-    sees &= found[2] > 0
+    turned = to[:, :, 0] * ray_x + to[:, :, 1] * ray_y + to[:, :, 2]  # [N, 3, h, w]
+    point = turned * view.depth + to[:, :, 3]
+    depth = point[:, 2].clamp_min(_TINY)  # [N, h, w]
+    focal = Ks.diagonal(dim1=1, dim2=2)[:, :2, None, None]  # [N, 2, 1, 1]
+    place = focal * point[:, :2] / depth[:, None] + Ks[:, :2, 2, None, None]  # px. [N, 2, h, w]
+    found = _read(others, place)  # [N, 3, h, w]
+    told, drawn, sees = found.unbind(dim=1)
     # Where nothing is drawn, nothing hides the point.
-    sees &= (depth < HIDDEN_DEPTH * found[1]) | (found[1] == 0)
-    return torch.where(sees, found[0], math.nan)
+    known = (depth < HIDDEN_DEPTH * drawn) | (drawn == 0)
+    known &= (sees > 0) & (point[:, 2] > 0) & (view.depth > 0)
+    return torch.where(known, told, math.nan)
+
+
+def _read(
+    views: Sequence[SmallView],
+    places: Tensor,  # In each view, in px [N, 2, h, w]
+) -> Tensor:
+    """Return the difference, the depth and 1 where the photo is valid, of each view at places in it. [N, 3, h, w]
+
+    All are 0 outside of the picture. The greatest difference near the place counts, since depth is not exact.
+    """
+    found = []
+    for view, place in zip(views, places, strict=True):
+        height, width = view.depth.shape
+        grid = torch.stack([place[0] * (2 / width) - 1, place[1] * (2 / height) - 1], dim=-1)
+        near = F.max_pool2d(view.difference[None], WINDOW, 1, WINDOW // 2)
+        planes = torch.stack([near[0], view.depth, view.valid.to(near)])[None]
+        found.append(F.grid_sample(planes, grid[None], mode="nearest", align_corners=False)[0])
+    return torch.stack(found)
 
 
 def spread(

@@ -28,7 +28,7 @@ from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import thread_count
 from sadgs_ns.training.step.structure_cache import StructureCache
 
-JUDGED_AT = (5 / 16, 1 / 2, 3 / 4, 1.0, 11 / 8)
+JUDGED_AT = (1 / 4, 1 / 2, 1.0, 11 / 8)
 """Times of judging as shares of densification, each an iteration before Gaussians are added, removed or reset. Later
 ones take wrong verdicts back, and find what the first left."""
 FEWEST_VIEWS = 3

@@ -57,7 +57,8 @@ class MovedRegions:
         """Return the region of a photo at a size in px (H, W). bool [H, W]"""
         if view not in self._regions:
             return torch.zeros(tuple(size), dtype=torch.bool)
-        enlarged = F.interpolate(self._regions[view][None, None], tuple(size), mode="nearest-exact")
+        region = self._regions[view].float()
+        enlarged = F.interpolate(region[None, None], tuple(size), mode="nearest-exact")
         return enlarged[0, 0] > 0
 
     def share(self, view: int) -> float:
