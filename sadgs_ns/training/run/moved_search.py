@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from sadgs_ns.geometry.moved import SmallView, Spread
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
-from sadgs_ns.training.run.progress import note
+from sadgs_ns.training.run.progress import note, warn
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import thread_count
 from sadgs_ns.training.step.structure_cache import StructureCache
@@ -35,6 +36,7 @@ FEWEST_VIEWS = 3
 """Training views from which something can be found: others must deny what one shows."""
 MASKS = "masks"
 """Name of the folder, in a run's, for masks of the photos in which something moved."""
+_DRAWN_TOGETHER = 4  # Views, which take less time than one after another
 _COVERED = 0.5  # Opacity from which a pixel's depth is that of something
 _VALID = 0.99  # Share of a small pixel that masks must leave
 
@@ -79,13 +81,20 @@ class MovedSearch:
     def judge(self) -> None:
         """Judge all training views anew, and leave out what moved by the present Gaussians.
 
-        All processes call this. Nothing is random, and nothing of the run changes if nothing is found.
+        All processes call this. Nothing is random, and nothing of the run changes if nothing is found. One process
+        keeps what it left out if the device's memory is full, and prints that.
         """
         world = self._model.strategy.world
-        found: dict[int, Tensor] = {}
-        views = self._small_views()
-        if world.rank == 0:
-            found = verdict(views).regions
+        try:
+            views = self._small_views()
+            found: dict[int, Tensor] = {}
+            if world.rank == 0:
+                found = verdict(views).regions
+        except torch.cuda.OutOfMemoryError:
+            if not world.is_single:  # The others would wait for this one.
+                raise
+            warn(f"Iteration {self._model.step + 1}: the device's memory is too full to find what moved.")
+            return
         if not world.is_single:
             found = self._shared(found)
         self._cache.forget(self._views.moved.replace(found))
@@ -93,29 +102,77 @@ class MovedSearch:
     @torch.no_grad()
     def _small_views(self) -> list[SmallView]:
         """Draw all training views at working size, and compare them with their photos; only rank 0 returns them."""
+        gaussians, _ = self._model.gaussians()
+        is_first = self._model.strategy.world.rank == 0
+        photos = self._photos()
+        views = []
+        for indices in self._batches():
+            colors, depths, cameras = self._draw(gaussians, indices)
+            if not is_first:
+                continue
+            size = (cameras.height, cameras.width)
+            for color, depth, viewmat, K in zip(colors, depths, cameras.viewmats, cameras.Ks, strict=True):
+                photo, valid = self._small_photo(next(photos), size)
+                views.append(SmallView(moved.difference(photo, color, valid), depth, valid, viewmat, K))
+        return views
+
+    def _batches(self) -> Iterator[list[int]]:
+        """Yield the training views in their order, as many at once as are drawn together; these have one size."""
+        for _, views in groupby(range(len(self._views)), key=lambda index: self._views.sizes[index]):
+            same_size = list(views)
+            for start in range(0, len(same_size), _DRAWN_TOGETHER):
+                yield same_size[start : start + _DRAWN_TOGETHER]
+
+    def _photos(self) -> Iterator[Mapping[str, Any]]:
+        """Yield the datamanager's data of all training views in their order; threads decode compressed images."""
+        images = self._views.datamanager.cached_train
+        if isinstance(images, list):
+            yield from images
+            return
+        threads = thread_count(self._views.datamanager.config.max_thread_workers)
+        with ThreadPoolExecutor(threads) as pool:
+            for start in range(0, len(images), 2 * threads):  # The host may have no room for all.
+                yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
+
+    def _draw(self, gaussians: Gaussians, indices: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
+        """Draw V views of one size at working size with their photos' gains; all processes have the whole pictures.
+
+        Returns colours in [0, 1] [V, 3, h, w], depths [V, h, w] and the small cameras.
+        """
         model = self._model
         world = model.strategy.world
-        gaussians, _ = model.gaussians()
-        if world.rank > 0:
-            for index in range(len(self._views)):
-                self._draw(gaussians, index)
-            return []
-        views = []
-        for index, data in enumerate(self._photos()):
-            colors, depth, cameras = self._draw(gaussians, index)
-            photo, valid = self._small_photo(data, (cameras.height, cameras.width))
-            difference = moved.difference(photo, colors, valid)
-            views.append(SmallView(difference, depth, valid, cameras.viewmats[0], cameras.Ks[0]))
-        return views
+        full_height, full_width = self._views.sizes[indices[0]]
+        height, width = moved.working_size((full_height, full_width))
+        viewmats, Ks = self._views.stacked_cameras(indices)
+        scale = Ks.new_tensor([width / full_width, height / full_height, 1.0])
+        cameras = Cameras(viewmats, Ks * scale[:, None], width, height)
+        pictures, _ = rasterize(world, gaussians, cameras, model.color_options(expected_depth=True))
+        whole = viewmats.new_zeros((len(indices), height, width, 5))
+        for band, rendered, opacity in pictures:
+            joined = torch.cat([rendered, opacity], dim=-1)
+            if band is None:
+                whole = joined
+            else:
+                rows = slice(band.first - band.top, band.last - band.top)
+                whole[band.view, band.first : band.last] = joined[0, rows]
+        world.sum(whole)
+        colors = whole[..., :3].contiguous()
+        alphas = whole[..., 4:].contiguous()
+        view_ids = model.view_ids(indices)
+        if model.has_view_colors and view_ids is not None:
+            colors = correct_colors(colors, alphas, model.view_matrices(model.trained_params, view_ids))
+        colors = model.before_background(colors, alphas, model.background).clamp(0, 1)
+        depths = torch.where(alphas[..., 0] > _COVERED, whole[..., 3], 0.0)
+        return colors.movedim(-1, 1), depths, cameras
 
     @torch.no_grad()
     def pictures(self, index: int) -> tuple[Tensor, Tensor]:
         """Return the photo of a view and its rendering, which this process draws alone, at working size. [3, h, w]"""
         gaussians, _ = self._model.gaussians()
-        colors, _, cameras = self._draw(gaussians, index)
+        colors, _, cameras = self._draw(gaussians, [index])
         data = self._views.datamanager.cached_train[index]
         photo, _ = self._small_photo(data, (cameras.height, cameras.width))
-        return photo, colors
+        return photo, colors[0]
 
     def _small_photo(self, data: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Return a photo in [0, 1] [3, h, w], and where no mask hides it, bool [h, w], at a size in px."""
@@ -135,37 +192,6 @@ class MovedSearch:
         with ThreadPoolExecutor(threads) as pool:
             for start in range(0, len(images), 2 * threads):  # The host may have no room for all.
                 yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
-
-    def _draw(self, gaussians: Gaussians, index: int) -> tuple[Tensor, Tensor, Cameras]:
-        """Draw a view at working size with its photo's gain: colours [3, h, w], depth [h, w] and the small camera.
-
-        All processes draw, and have the whole picture.
-        """
-        model = self._model
-        world = model.strategy.world
-        height, width = moved.working_size(self._views.sizes[index])
-        viewmats, Ks = self._views.stacked_cameras([index])
-        full_height, full_width = self._views.sizes[index]
-        scale = Ks.new_tensor([width / full_width, height / full_height, 1.0])
-        cameras = Cameras(viewmats, Ks * scale[:, None], width, height)
-        pictures, _ = rasterize(world, gaussians, cameras, model.color_options(expected_depth=True))
-        picture = viewmats.new_zeros((1, height, width, 5))
-        for band, rendered, opacity in pictures:
-            joined = torch.cat([rendered, opacity], dim=-1)
-            if band is None:
-                picture = joined
-            else:
-                picture[:, band.first : band.last] = joined[:, band.first - band.top : band.last - band.top]
-        world.sum(picture)
-        colors = picture[..., :3].contiguous()
-        depth = picture[..., 3]
-        alphas = picture[..., 4:].contiguous()
-        view_ids = model.view_ids([index])
-        if model.has_view_colors and view_ids is not None:
-            colors = correct_colors(colors, alphas, model.view_matrices(model.trained_params, view_ids))
-        colors = model.before_background(colors, alphas, model.background).clamp(0, 1)
-        depth = torch.where(alphas[..., 0] > _COVERED, depth, 0.0)
-        return colors[0].movedim(-1, 0), depth[0], cameras
 
     def _shared(self, found: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Return the regions that rank 0 found, in all processes."""

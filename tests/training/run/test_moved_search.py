@@ -16,10 +16,11 @@ from examples.drawn_scene.scene import write_scene
 from helpers.gloo_ranks import run_ranks
 from helpers.kill_and_resume import configure, differences, set_up
 from helpers.sharded_training import set_up_together
+from helpers.short_runs import nerfstudio_data
 from sadgs_ns.data.images import valid_pixels
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.run.moved_search import common_folder, judged_steps
+from sadgs_ns.training.run.moved_search import MovedSearch, common_folder, judged_steps
 from sadgs_ns.training.run.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 20, 500
@@ -171,6 +172,33 @@ def test_a_verdict_is_taken_back(clean: Path, tmp_path: Path):
     trainer.train()
     assert not hidden_pixels(trainer, 0).any()
     assert not (trainer.pipeline.structure_cache[0][..., 1] == 255).any()
+
+
+@pytest.mark.hard_case("a GPU's memory that is full while a run looks for what moved", "trains on, with a warning")
+def test_full_memory_ends_no_run(clean: Path, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
+    def fill(self: MovedSearch) -> None:
+        raise torch.cuda.OutOfMemoryError("full")
+
+    monkeypatch.setattr(MovedSearch, "_small_views", fill)
+    trainer = set_up(finding(clean, tmp_path, iterations=4))
+    put_region(trainer)
+    trainer.train()
+    assert trainer.pipeline.views.moved.views == [0]
+    assert "memory is too full to find what moved" in capsys.readouterr().out
+
+
+@pytest.mark.hard_case("things that moved before photos of several sizes", "judged at each photo's own size")
+def test_photos_of_several_sizes_are_judged(tmp_path: Path):
+    parser = nerfstudio_data(tmp_path / "data", [(WIDTH, HEIGHT), (40, 30)], masks=True)
+    config = finding(parser.data, tmp_path / "run", iterations=4)
+    config.pipeline.datamanager.dataparser = parser
+    config.pipeline.model.num_random = POINTS
+    trainer = set_up(config)
+    verdict = trainer.pipeline.moved_search.evidence()
+    sizes = trainer.pipeline.views.sizes
+    assert [tuple(view.depth.shape) for view in verdict.views] == sizes and len({*sizes}) == 2
+    for view in verdict.views:
+        assert not view.valid[:, : view.valid.shape[1] // 2].any() and view.valid[:, -1].all()
 
 
 @pytest.mark.parametrize("storage", ["gpu", "cpu", "compressed"])
