@@ -182,17 +182,6 @@ class MovedSearch:
             valid = _reduced(data["mask"].to(photo), size)[0] > _VALID
         return photo, valid
 
-    def _photos(self) -> Iterator[Mapping[str, Any]]:
-        """Yield the datamanager's data of all training views in their order; threads decode compressed images."""
-        images = self._views.datamanager.cached_train
-        if isinstance(images, list):
-            yield from images
-            return
-        threads = thread_count(self._views.datamanager.config.max_thread_workers)
-        with ThreadPoolExecutor(threads) as pool:
-            for start in range(0, len(images), 2 * threads):  # The host may have no room for all.
-                yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
-
     def _shared(self, found: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Return the regions that rank 0 found, in all processes."""
         world = self._model.strategy.world
