@@ -24,7 +24,7 @@ from sadgs_ns.geometry.moved import SmallView, Spread
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
-from sadgs_ns.training.run.progress import note, warn
+from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.images import thread_count
 from sadgs_ns.training.step.structure_cache import StructureCache
@@ -211,7 +211,7 @@ class MovedSearch:
         shares = [regions.share(view) for view in regions.views]
         mean = sum(shares) / len(shares)
         written = self._write_masks(folder / MASKS)
-        note(
+        warn(
             f"Something moved in {len(regions)} of {len(self._views)} training photos, in {mean:.1%} of their pixels, "
             f"which were left out: see {written}. --pipeline.find-moved False leaves nothing out."
         )
