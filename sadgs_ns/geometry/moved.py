@@ -47,8 +47,9 @@ LEAST_EXCESS = 0.1
 """Excess of colours in [0, 1] that `STRONG` pixels have at least: less may be the light."""
 SMALLEST_SHARE = 0.003
 """Smallest share of a photo's pixels that the `STRONG` pixels of a region cover."""
-DILATION = 2
-"""Pixels by which regions are dilated, as edges are blurred and things throw contact shadows."""
+DILATION = 1
+"""Pixels, at least 1, by which regions are dilated, as edges are blurred and things throw shadows. The windows of the
+differences reach beyond outlines, too."""
 _SAMPLES = 200_000  # Pixels of all views of which median and spread are taken
 _POINTS = 1000  # Points on surfaces that tell which views see the same things
 _FEWEST_PIXELS = 4  # Of a region in the smallest photos
