@@ -1,5 +1,6 @@
-# From a bare checkout with Python 3.10-3.13, a C compiler and make: `make demo`, `make test`, `make gate`, `make lint`,
-# and `make test-portable`, the tests of the method and the splatter as a plainer processor rounds.
+# From a bare checkout with Python 3.10-3.13, a C compiler and make: `make demo`, `make test`, `make test-slow` (what
+# `make test` leaves out), `make gate`, `make lint`, and `make test-portable`, the tests of the method and the splatter
+# as a plainer processor rounds.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -10,13 +11,27 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-portable gate lint docs clean
+.PHONY: demo test test-slow test-portable gate lint docs clean
 
 demo: $(STAMP)
 	$(BIN)/python -m examples.drawn_scene
 
+# The moving picture and the splat of docs/gallery.md, trained on the CPU.
+.PHONY: turn
+turn: $(STAMP)
+	$(BIN)/python -m examples.drawn_scene.scene turn-output/demo --width 320 --height 240 --views 64
+	CUDA_VISIBLE_DEVICES= $(BIN)/ns-train sadgs --data turn-output/demo --output-dir turn-output --timestamp run \
+	  --vis tensorboard --max-num-iterations 600 --pipeline.views-per-iteration 1 --pipeline.model.sh-degree 0 \
+	  --pipeline.model.strategy.max-gaussians 10000
+	$(BIN)/python -m examples.turn turn-output/demo/sadgs/run --output turn-output/turn.webp --shrink 3
+	$(BIN)/sadgs-export turn-output/demo/sadgs/run --output turn-output/room.ply --frame colmap
+
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+# Tests of rare cases, and of whole commands in processes of their own, which `test` leaves out.
+test-slow: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m slow
 
 # ATEN_CPU_CAPABILITY=default keeps torch from its AVX2 and AVX-512 kernels, which round differently. A test that
 # fails in only one of `test` and `test-portable` depends on the processor.
@@ -50,5 +65,5 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-output turn-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find sadgs_ns benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

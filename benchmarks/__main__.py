@@ -32,6 +32,7 @@ COMMANDS = {
     "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "kernels": ("kernel_share:Command", "what each Triton kernel brings: steps with its twin in its place (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
+    "captures": ("captures:Command", "where the tables' captures come from, and whether a folder holds them"),
     "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
     "cameras": ("cameras:Command", "how accurately cameras are placed, with several seeds and losses"),
     "seconds": ("seconds:Command", "what a user waits for: the parts of a command side by side"),

@@ -3,6 +3,8 @@
 Run `python -m examples.simple_trainer` in a checkout, on a machine with CUDA.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from gsplat import rasterization
@@ -21,15 +23,20 @@ RATES = {"means": 5e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0":
 def start_from(points: Tensor, colors: Tensor, scale: float) -> dict[str, Parameter]:
     """Return spheres of one size at points [N, 3], with colours in [0, 1] [N, 3], as gsplat's parameters."""
     number = len(points)
-    values = {
-        "means": points,
-        "scales": torch.full_like(points, scale).log(),
-        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(number, 1).to(points),
-        "opacities": torch.full_like(points[:, 0], 0.1).logit(),
-        "sh0": ((colors - 0.5) / 0.2821)[:, None],
-        "shN": points.new_zeros((number, 15, 3)),
-    }
+    values = {}
+    values["means"] = points
+    values["scales"] = torch.full_like(points, scale).log()
+    values["quats"] = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(number, 1).to(points)
+    values["opacities"] = torch.full_like(points[:, 0], 0.1).logit()
+    values["sh0"] = ((colors - 0.5) / 0.2821)[:, None]
+    values["shN"] = points.new_zeros((number, 15, 3))
     return {name: Parameter(value) for name, value in values.items()}
+
+
+def activate(params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return means, quaternions, scales, opacities and SH coefficients, as gsplat's rasterization takes them."""
+    coefficients = torch.cat([params["sh0"], params["shN"]], dim=1)  # [N, 16, 3]
+    return params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(), coefficients
 
 
 def train(
@@ -42,7 +49,9 @@ def train(
     strategy: StructureAwareStrategy,
 ) -> float:
     """Train the parameters, which densification replaces, and return PSNR of the last step's view in dB."""
-    optimizers = {name: torch.optim.Adam([params[name]], lr=rate, eps=1e-15) for name, rate in RATES.items()}
+    optimizers = {}
+    for name, rate in RATES.items():
+        optimizers[name] = torch.optim.Adam([params[name]], lr=rate, eps=1e-15)
     fitted = strategy.for_run(iterations)
     fitted.check_sanity(params, optimizers)
     state = fitted.initialize_state(scene_scale)
@@ -52,22 +61,14 @@ def train(
     error = images.new_tensor(1.0)
     for step in range(iterations):
         view = [step % len(images)]  # One view or several; the loss is their mean.
+        absgrad = fitted.needs_absgrad(step)
         renders, _, info = rasterization(
-            params["means"],
-            params["quats"],
-            params["scales"].exp(),
-            params["opacities"].sigmoid(),
-            torch.cat([params["sh0"], params["shN"]], dim=1),
-            viewmats[view],
-            Ks[view],
-            width,
-            height,
-            sh_degree=3,
-            packed=False,
-            absgrad=fitted.needs_absgrad(step),
+            *activate(params), viewmats[view], Ks[view], width, height, sh_degree=3, packed=False, absgrad=absgrad
         )
         # The strategy reads these three beside gsplat's entries.
-        info |= {"structure_tensors": tensors[view], "viewmats": viewmats[view], "Ks": Ks[view]}
+        info["structure_tensors"] = tensors[view]
+        info["viewmats"] = viewmats[view]
+        info["Ks"] = Ks[view]
         fitted.step_pre_backward(params, optimizers, state, step, info)
         loss = (renders - images[view]).abs().mean()
         if step < fitted.windows.refine_stop_iter:

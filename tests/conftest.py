@@ -7,7 +7,6 @@ Where there is a GPU, tests train on it; those that compare runs bit by bit, or 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import signal
 import sys
@@ -37,12 +36,9 @@ os.environ["NUMBA_NUM_THREADS"] = str(THREADS)
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # read when a kernel is defined: they then run on the CPU, slowly
     with contextlib.suppress(ImportError, AttributeError, TypeError):
-        # Of every sum and product of integers the interpreter computes whether it overflows, half of its time, only to
-        # throw the answer away: it does not assert anything unless it is debugged.
-        from triton.runtime.interpreter import interpreter_builder
+        from helpers.quick_interpreter import speed_up
 
-        if not interpreter_builder.options.debug:
-            interpreter_builder.options = dataclasses.replace(interpreter_builder.options, sanitize_overflow=False)
+        speed_up()
 
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
     # Where a shell lets its children ignore Ctrl-C (nohup, in the background), so would the runs that tests interrupt.
@@ -95,7 +91,8 @@ def pytest_runtest_teardown() -> None:
 
 def close_loggers() -> None:
     """Take away the loggers of the test's runs, to which all later runs of this process would write, too."""
-    if (writer := sys.modules.get("nerfstudio.utils.writer")) is not None:
+    writer = sys.modules.get("nerfstudio.utils.writer")
+    if writer is not None:
         for logger in writer.EVENT_WRITERS:
             if hasattr(logger, "tb_writer"):
                 logger.tb_writer.close()  # which has a thread and a file

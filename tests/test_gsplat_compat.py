@@ -85,7 +85,9 @@ def test_signatures(function: Callable[..., Any]):
 def test_the_starts_of_tile_lists_take_four_arguments_by_their_places():
     """The second has another name in 1.5, n_images."""
     parameters = list(inspect.signature(gsplat.isect_offset_encode).parameters)
-    assert len(parameters) == 4 and parameters[0] == "isect_ids" and parameters[2:] == ["tile_width", "tile_height"]
+    assert len(parameters) == 4
+    assert parameters[0] == "isect_ids"
+    assert parameters[2:] == ["tile_width", "tile_height"]
 
 
 def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: pytest.MonkeyPatch):
@@ -94,17 +96,19 @@ def test_the_projection_gets_what_gsplats_rasterization_gives_it(monkeypatch: py
     viewmats, Ks = cameras()
     scene = gaussians()
     geometry = scene["means"], scene["quats"], scene["scales"], scene["opacities"]
-    expected, found = (
-        first_call(monkeypatch, signature, call)
-        for call in (
-            lambda: gsplat.rasterization(
-                *geometry, torch.ones(N, 3), viewmats, Ks, 40, 30, near_plane=0.7, packed=False
-            ),
-            lambda: gsplat_compat.project(*geometry, viewmats, Ks, 40, 30, 0.7),
-        )
-    )
+    colors = torch.ones(N, 3)
+
+    def rasterize() -> None:
+        gsplat.rasterization(*geometry, colors, viewmats, Ks, 40, 30, near_plane=0.7, packed=False)
+
+    def project() -> None:
+        gsplat_compat.project(*geometry, viewmats, Ks, 40, 30, 0.7)
+
+    expected = first_call(monkeypatch, signature, rasterize)
+    found = first_call(monkeypatch, signature, project)
     assert found.keys() == expected.keys()
-    assert all(found[name] is expected[name] or found[name] == expected[name] for name in found)
+    for name in found:
+        assert found[name] is expected[name] or found[name] == expected[name]
 
 
 def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
@@ -121,19 +125,24 @@ def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_projection_and_harmonics_in_torch_are_gsplats_bit_by_bit(dtype: torch.dtype):
     generator = torch.Generator().manual_seed(0)
-    means, quats, scales, coefficients, directions = (
-        torch.randn(shape, generator=generator, dtype=dtype)
-        for shape in ((200, 3), (200, 4), (200, 3), (2, 200, 16, 3), (2, 200, 3))
-    )
+    means = torch.randn((200, 3), generator=generator, dtype=dtype)
+    quats = torch.randn((200, 4), generator=generator, dtype=dtype)
+    scales = torch.randn((200, 3), generator=generator, dtype=dtype)
+    coefficients = torch.randn((2, 200, 16, 3), generator=generator, dtype=dtype)
+    directions = torch.randn((2, 200, 3), generator=generator, dtype=dtype)
     viewmats, Ks = (value.to(dtype) for value in cameras())
     viewmats[1, :3, 3] = torch.tensor([0.3, -0.2, 4.0])
     covars, _ = _torch_impl._quat_scale_to_covar_preci(quats, scales, compute_preci=False)
-    assert covars is not None and torch.equal(ewa.covariances(quats, scales), covars)
+    assert covars is not None
+    assert torch.equal(ewa.covariances(quats, scales), covars)
     seen = _torch_impl._world_to_cam(means, covars, viewmats)
     found = ewa.world_to_camera(means, covars, viewmats)
-    assert torch.equal(found[0], seen[0]) and torch.equal(found[1], seen[1])
-    projected, expected = (f(*seen, Ks, 40, 30) for f in (ewa.perspective, _torch_impl._persp_proj))
-    assert torch.equal(projected[0], expected[0]) and torch.equal(projected[1], expected[1])
+    assert torch.equal(found[0], seen[0])
+    assert torch.equal(found[1], seen[1])
+    projected = ewa.perspective(*seen, Ks, 40, 30)
+    expected = _torch_impl._persp_proj(*seen, Ks, 40, 30)
+    assert torch.equal(projected[0], expected[0])
+    assert torch.equal(projected[1], expected[1])
     for degree in range(4):
         gradients = []
         for function in (ewa.spherical_harmonics, _torch_impl._spherical_harmonics):
@@ -141,7 +150,8 @@ def test_projection_and_harmonics_in_torch_are_gsplats_bit_by_bit(dtype: torch.d
             value = function(degree, *leaves)
             value.square().sum().backward()
             gradients.append([value, *(leaf.grad for leaf in leaves if leaf.grad is not None)])
-        assert all(torch.equal(one, other) for one, other in zip(*gradients, strict=True)), degree
+        for one, other in zip(*gradients, strict=True):
+            assert torch.equal(one, other), degree
         assert len(gradients[0]) == (3 if degree else 2), "colours of degree 0 depend on no direction"
 
 

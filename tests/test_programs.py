@@ -43,7 +43,8 @@ def test_the_wheels_files_are_those_that_the_wheels_name(empty_path: Path, monke
     assert programs.find_ffmpeg() == imageio_ffmpeg.get_ffmpeg_exe()
     assert programs.load_libusb() == str(libusb_package.get_library_path())
     for path in (programs.find_ffmpeg(), programs.load_libusb(), *WHEELS_NODE.npm):
-        assert path is not None and programs.is_of_wheel(path)
+        assert path is not None
+        assert programs.is_of_wheel(path)
     assert not programs.is_of_wheel(str(empty_path / "node"))
 
 
@@ -67,7 +68,8 @@ def test_what_the_system_has_is_kept(version: str, empty_path: Path, tmp_path: P
     assert programs.load_libusb() == "libc.so.6"
     before = os.environ["PATH"]
     programs.put_ffmpeg_into_path()
-    assert os.environ["PATH"] == before and programs.FFMPEG_VARIABLE not in os.environ
+    assert os.environ["PATH"] == before
+    assert programs.FFMPEG_VARIABLE not in os.environ
 
 
 @pytest.mark.hard_case("Node.js older than 18.20, without npm, or another program called node", "the wheel's is taken")

@@ -146,7 +146,8 @@ def test_a_signal_is_passed_on_once_and_the_function_may_save(program):
 
     with pytest.raises(Interrupted, match="SIGTERM"), Interrupts(waiting=lambda: True):
         run(log, on_event=hear, saves=True)
-    assert heard == ["ready", "stopping"] and log.read_text("utf8") == "saved\n"
+    assert heard == ["ready", "stopping"]
+    assert log.read_text("utf8") == "saved\n"
 
 
 @pytest.mark.hard_case("the training of `sadgs` is killed", "one sentence; the same command resumes")
@@ -167,9 +168,12 @@ def test_a_function_does_not_outlive_the_command_that_is_killed(program, tmp_pat
         f"Worker('program:function', pathlib.Path({str(log)!r}), saves=True).run(on_event=print)"
     )
     command = subprocess.Popen([sys.executable, "-c", parent])
-    while not (log.exists() and (found := re.search(r"^pid (\d+)$", log.read_text("utf8"), re.MULTILINE))):
+    found = None
+    while found is None:
         assert command.poll() is None
         time.sleep(0.05)
+        if log.exists():
+            found = re.search(r"^pid (\d+)$", log.read_text("utf8"), re.MULTILINE)
     command.kill()
     command.wait()
     end = time.monotonic() + HANGS

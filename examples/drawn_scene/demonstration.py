@@ -56,8 +56,11 @@ class Run:
 
     def mean(self, metric: Callable[[Tensor, Tensor], Tensor]) -> float:
         """Mean over the held-out views of a metric of two images [1, 3, H, W]."""
-        pairs = [torch.stack(pair).permute(0, 3, 1, 2) for pair in zip(self.renders, self.targets, strict=True)]
-        return float(torch.stack([metric(pair[:1], pair[1:]) for pair in pairs]).mean())
+        values = []
+        for render, target in zip(self.renders, self.targets, strict=True):
+            pair = torch.stack([render, target]).permute(0, 3, 1, 2)
+            values.append(metric(pair[:1], pair[1:]))
+        return float(torch.stack(values).mean())
 
 
 def fit_densification(strategy: StructureAwareStrategy, max_gaussians: int) -> None:
@@ -73,16 +76,21 @@ def run_config(output: Path, label: str, iterations: int, max_gaussians: int) ->
     The label, one of `ROWS`, also names the run's folder in that of the demo.
     """
     config: SadgsTrainerConfig = copy.deepcopy(presets.sadgs.config)  # type: ignore[assignment]
-    config.output_dir, config.experiment_name, config.timestamp = output / "runs", label.replace(" ", "-"), "latest"
-    config.vis, config.logging.local_writer.enable = "tensorboard", False
+    config.output_dir = output / "runs"
+    config.experiment_name = label.replace(" ", "-")
+    config.timestamp = "latest"
+    config.vis = "tensorboard"
+    config.logging.local_writer.enable = False
     config.max_num_iterations = iterations
-    config.steps_per_save = config.steps_per_eval_image = 0
+    config.steps_per_save = 0
+    config.steps_per_eval_image = 0
     config.pipeline.datamanager.cache_images = "gpu"  # This is the training device; "cpu" pins memory, which needs CUDA
     config.pipeline.datamanager.dataparser = ColmapDataParserConfig(
         data=output / "scene", colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_interval=EVAL_INTERVAL
     )
     config.optimizers["opacities"]["optimizer"].lr = OPACITY_LR
-    strategy, (densify, split) = config.pipeline.model.strategy, ROWS[label]
+    strategy = config.pipeline.model.strategy
+    densify, split = ROWS[label]
     fit_densification(strategy, max_gaussians)
     if not densify:
         strategy.refine_stop_iter = 0
@@ -104,7 +112,8 @@ def train(config: SadgsTrainerConfig, on_step: Callable[[int], None]) -> Run:
     run.pipeline.eval()
     dataset = run.pipeline.datamanager.eval_dataset
     for index in range(len(dataset)):
-        rendered = run.pipeline.model.get_outputs_for_camera(dataset.cameras[index : index + 1])
+        camera = dataset.cameras[index : index + 1]
+        rendered = run.pipeline.model.get_outputs_for_camera(camera)
         run.renders.append(rendered["rgb"].cpu())
         run.targets.append(dataset.get_image_float32(index).cpu())
     return run
@@ -114,7 +123,8 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
     """Draw the photo of a training view, the estimated and the true period of its texture, and η after each run."""
     pipeline = runs["sadgs"].pipeline
     view = get_view(pipeline, 0)
-    truth = expected_wavelength_map(scene.surfaces, next(v for v in scene.views if v.name == view.name))
+    drawn_views = {drawn.name: drawn for drawn in scene.views}
+    truth = expected_wavelength_map(scene.surfaces, drawn_views[view.name])
     estimate = maps.texture_period(view.structure_tensor, pipeline.config.frequency_constant)
     panels = [
         Panel(f"training view {view.name}", to_picture(view.photo)),
@@ -124,8 +134,30 @@ def draw_wavelength_and_eta(path: Path, scene: SceneDescription, runs: dict[str,
     for label, run in runs.items():
         params = dict(run.pipeline.model.gauss_params.items())
         statistics = observe_training_views(run.pipeline.structure_cache)
-        panels.append(Panel(f"η, {label}", ETA(maps.eta_map(params, statistics, view.camera)), ETA))
+        eta = maps.eta_map(params, statistics, view.camera)
+        panels.append(Panel(f"η, {label}", ETA(eta), ETA))
     color_scales.draw(path, panels, columns=3)
+
+
+def table_of(runs: dict[str, Run]) -> Table:
+    """Return the runs' metrics on the held-out views, a row each."""
+    table = Table("held-out views", "PSNR (dB)", "SSIM", "Gaussians", "seconds")
+    for label, run in runs.items():
+        model = run.pipeline.model
+        psnr = run.mean(model.psnr)
+        ssim = run.mean(model.ssim)
+        table.add_row(label, f"{psnr:.2f}", f"{ssim:.4f}", f"{model.num_points}", f"{run.seconds:.0f}")
+    return table
+
+
+def draw_side_by_side(path: Path, runs: dict[str, Run]) -> None:
+    """Draw a row for each held-out view: its photo, and what each run shows there."""
+    panels = []
+    for index, photo in enumerate(runs["sadgs"].targets):
+        panels.append(Panel("photo", to_picture(photo)))
+        for label, run in runs.items():
+            panels.append(Panel(label, to_picture(run.renders[index])))
+    color_scales.draw(path, panels, columns=1 + len(runs))
 
 
 def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, height: int, views: int) -> None:
@@ -135,10 +167,12 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
     """
     if iterations < 30:
         raise ValueError(f"--max-num-iterations is {iterations}; give at least 30, or nothing is split")
-    console, runs = Console(), {}
+    console = Console()
     scene = write_scene(output / "scene", width, height, views)
     console.print(f"Scene: {views} views of {width}×{height} px, {len(scene.points)} points, in {output}/scene")
-    CONSOLE.quiet, was_quiet = True, CONSOLE.quiet  # This is nerfstudio's console; the demo prints its own few lines.
+    was_quiet = CONSOLE.quiet
+    CONSOLE.quiet = True  # This is nerfstudio's console; the demo prints its own few lines.
+    runs = {}
     try:
         with Progress(console=console) as progress:
             for label in ROWS:
@@ -147,16 +181,9 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
                 runs[label] = train(config, lambda step, task=task: progress.update(task, completed=step + 1))
     finally:
         CONSOLE.quiet = was_quiet
-    table = Table("held-out views", "PSNR (dB)", "SSIM", "Gaussians", "seconds")
-    panels = [[Panel("photo", to_picture(target)) for target in runs["sadgs"].targets]]
-    for label, run in runs.items():
-        model = run.pipeline.model
-        metrics = f"{run.mean(model.psnr):.2f}", f"{run.mean(model.ssim):.4f}"
-        table.add_row(label, *metrics, f"{model.num_points}", f"{run.seconds:.0f}")
-        panels.append([Panel(label, to_picture(render)) for render in run.renders])
-    console.print(table, "One drawn scene and one seed: an illustration, not a measurement of the method.", sep="\n")
-    side_by_side = [panel for row in zip(*panels, strict=True) for panel in row]  # A row for each held-out view.
-    color_scales.draw(output / "side_by_side.png", side_by_side, columns=len(panels))
+    console.print(table_of(runs))
+    console.print("One drawn scene and one seed: an illustration, not a measurement of the method.")
+    draw_side_by_side(output / "side_by_side.png", runs)
     draw_wavelength_and_eta(output / "wavelength_and_eta.png", scene, runs)
     write_gaussians(output / "splat.ply", dict(runs["sadgs"].pipeline.model.gauss_params.items()))
     for name in ("side_by_side.png", "wavelength_and_eta.png", "splat.ply"):

@@ -52,8 +52,13 @@ class Rectangle:
     @property
     def _directions(self) -> tuple[Array, Array]:
         """The texture's own orthonormal axes in the plane. [3] each"""
-        u, v = self.edge_u / np.linalg.norm(self.edge_u), self.edge_v / np.linalg.norm(self.edge_v)
-        return np.cos(self.angle) * u + np.sin(self.angle) * v, np.cos(self.angle) * v - np.sin(self.angle) * u
+        u = self.edge_u / np.linalg.norm(self.edge_u)
+        v = self.edge_v / np.linalg.norm(self.edge_v)
+        cosine = np.cos(self.angle)
+        sine = np.sin(self.angle)
+        along = cosine * u + sine * v
+        across = cosine * v - sine * u
+        return along, across
 
     @property
     def frequencies(self) -> Array:
@@ -70,20 +75,25 @@ class Rectangle:
         with np.errstate(divide="ignore", invalid="ignore"):
             t = self.normal @ (self.corner - origin) / (directions @ self.normal)  # [R]
             local = origin + t[:, None] * directions - self.corner  # [R, 3]
-            u, v = local @ self.edge_u / (self.edge_u @ self.edge_u), local @ self.edge_v / (self.edge_v @ self.edge_v)
+            u = local @ self.edge_u / (self.edge_u @ self.edge_u)
+            v = local @ self.edge_v / (self.edge_v @ self.edge_v)
             hit = (t > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
         return np.where(hit, t, np.inf)
 
     def colour(self, points: Array) -> Array:
         """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
-        a, b = ((points - self.corner) @ direction for direction in self._directions)  # [P] each
+        along, across = self._directions
+        a = (points - self.corner) @ along  # [P]
+        b = (points - self.corner) @ across  # [P]
         wave = np.zeros(len(points))
         if self.texture == "grating":
             wave = np.sin(2 * np.pi * a / self.wavelength)
         elif self.texture == "checker":
             side = self.wavelength / np.sqrt(2.0)
-            wave = np.where((np.floor(a / side) + np.floor(b / side)) % 2 == 0, 1.0, -1.0)
-        dark, bright = np.array(self.dark), np.array(self.bright)
+            square = np.floor(a / side) + np.floor(b / side)
+            wave = np.where(square % 2 == 0, 1.0, -1.0)
+        dark = np.array(self.dark)
+        bright = np.array(self.bright)
         return dark + (bright - dark) * (0.5 + 0.5 * wave[:, None])
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
@@ -113,7 +123,8 @@ class Sphere:
     def depth(self, origin: Array, directions: Array) -> Array:
         """Ray parameter of the nearest hit, inf where there is none. origin [3], directions [R, 3] → [R]"""
         offset = origin - self.centre
-        a, b = (directions**2).sum(1), directions @ offset  # [R] each
+        a = (directions**2).sum(1)  # [R]
+        b = directions @ offset  # [R]
         discriminant = b**2 - a * (offset @ offset - self.radius**2)
         t = (-b - np.sqrt(np.maximum(discriminant, 0))) / a
         return np.where((discriminant > 0) & (t > 0), t, np.inf)
@@ -161,8 +172,9 @@ class View:
     def project(self, points: Array) -> tuple[Array, Array]:
         """World points → pixel positions [P, 2] and depths [P]."""
         camera = points @ self.rotation.T + self.translation  # [P, 3]
+        middle = 0.5 * np.array([self.width, self.height])
         with np.errstate(divide="ignore", invalid="ignore"):
-            pixels = self.focal * camera[:, :2] / camera[:, 2:] + 0.5 * np.array([self.width, self.height])
+            pixels = self.focal * camera[:, :2] / camera[:, 2:] + middle
         return pixels, camera[:, 2]
 
 
@@ -187,7 +199,8 @@ def render(surfaces: Sequence[Surface], view: View, supersampling: int = 4) -> N
     samples = np.zeros((len(directions), 3))
     for i, surface in enumerate(surfaces):
         on = index == i
-        samples[on] = surface.colour(view.position + depth[on, None] * directions[on])
+        hits = view.position + depth[on, None] * directions[on]
+        samples[on] = surface.colour(hits)
     samples = samples.reshape(view.height, supersampling, view.width, supersampling, 3)
     return np.rint(255 * samples.mean(axis=(1, 3))).astype(np.uint8)
 
@@ -210,8 +223,10 @@ def expected_wavelength_map(surfaces: Sequence[Surface], view: View) -> NDArray[
         on = index == i
         slant = (per_pixel @ surface.normal) / (directions[on] @ surface.normal)[:, None]  # [R, 2]
         for wave in surface.frequencies:  # [3]
-            gradient = depth[on, None] * (per_pixel @ wave - (directions[on] @ wave)[:, None] * slant)  # [R, 2]
-            frequency[on] = np.maximum(frequency[on], np.hypot(gradient[:, 0], gradient[:, 1]))
+            along_rays = (directions[on] @ wave)[:, None]  # [R, 1]
+            gradient = depth[on, None] * (per_pixel @ wave - along_rays * slant)  # [R, 2]
+            steepness = np.hypot(gradient[:, 0], gradient[:, 1])  # [R]
+            frequency[on] = np.maximum(frequency[on], steepness)
     with np.errstate(divide="ignore"):
         wavelength = np.where(frequency > 0, 1.0 / frequency, np.nan)
     return wavelength.reshape(view.height, view.width).astype(np.float32)

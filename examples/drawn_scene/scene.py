@@ -45,7 +45,11 @@ class SceneDescription:
     @property
     def wavelengths(self) -> dict[str, float]:
         """Wavelength of each textured surface in world units, by the surface's name."""
-        return {s.name: s.wavelength for s in self.surfaces if isinstance(s, Rectangle) and s.texture != "plain"}
+        wavelengths = {}
+        for surface in self.surfaces:
+            if isinstance(surface, Rectangle) and surface.texture != "plain":
+                wavelengths[surface.name] = surface.wavelength
+        return wavelengths
 
 
 def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float], turn: float, *texture) -> list:
@@ -53,12 +57,19 @@ def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float
 
     The size is along the box's own axes, and `texture` the last fields of `Rectangle`, from `dark`.
     """
-    x = np.array([np.cos(turn), np.sin(turn), 0.0]) * size[0]
-    y = np.array([-np.sin(turn), np.cos(turn), 0.0]) * size[1]
+    cosine = np.cos(turn)
+    sine = np.sin(turn)
+    x = np.array([cosine, sine, 0.0]) * size[0]
+    y = np.array([-sine, cosine, 0.0]) * size[1]
     z = np.array([0.0, 0.0, size[2]])
     low = np.array([*centre, 0.0]) - 0.5 * (x + y)
-    faces = [("front", low, x, z), ("left", low, y, z), ("back", low + y, x, z), ("right", low + x, y, z)]
-    faces.append(("top", low + z, x, y))
+    faces = [
+        ("front", low, x, z),
+        ("left", low, y, z),
+        ("back", low + y, x, z),
+        ("right", low + x, y, z),
+        ("top", low + z, x, y),
+    ]
     return [Rectangle(f"{name} {side}", corner, u, v, *texture) for side, corner, u, v in faces]
 
 
@@ -66,18 +77,15 @@ def room_surfaces() -> tuple[Surface, ...]:
     """The room corner: a floor, two walls, two boxes and a plain sphere. World units; the room is 3 wide, 2.2 high."""
     x, y, z = np.diag([3.0, 3.0, 2.2])
     origin = np.zeros(3)
-    return (
-        Rectangle("floor", origin, x, y, (0.25, 0.2, 0.15), (0.85, 0.8, 0.7), "checker", 0.5, 0.4),
-        Rectangle("fine wall", origin, x, z, (0.15, 0.25, 0.45), (0.75, 0.85, 0.95), "grating", 0.15),
-        Rectangle("coarse wall", origin, y, z, (0.5, 0.2, 0.15), (0.95, 0.75, 0.5), "grating", 0.35, 1.0),
-        *_box(
-            "tall box", (0.65, 1.35), (0.5, 0.5, 1.1), 0.4, (0.1, 0.3, 0.1), (0.7, 0.9, 0.5), "grating", 0.2, np.pi / 2
-        ),
-        *_box(
-            "faint box", (1.5, 0.6), (0.7, 0.5, 0.5), -0.3, (0.5, 0.42, 0.55), (0.62, 0.54, 0.67), "grating", 0.14, 0.6
-        ),
-        Sphere("sphere", np.array([1.45, 1.5, 0.3]), 0.3, (0.9, 0.5, 0.3)),
-    )
+    floor = Rectangle("floor", origin, x, y, (0.25, 0.2, 0.15), (0.85, 0.8, 0.7), "checker", 0.5, 0.4)
+    fine_wall = Rectangle("fine wall", origin, x, z, (0.15, 0.25, 0.45), (0.75, 0.85, 0.95), "grating", 0.15)
+    coarse_wall = Rectangle("coarse wall", origin, y, z, (0.5, 0.2, 0.15), (0.95, 0.75, 0.5), "grating", 0.35, 1.0)
+    tall_texture = ((0.1, 0.3, 0.1), (0.7, 0.9, 0.5), "grating", 0.2, np.pi / 2)
+    tall_box = _box("tall box", (0.65, 1.35), (0.5, 0.5, 1.1), 0.4, *tall_texture)
+    faint_texture = ((0.5, 0.42, 0.55), (0.62, 0.54, 0.67), "grating", 0.14, 0.6)
+    faint_box = _box("faint box", (1.5, 0.6), (0.7, 0.5, 0.5), -0.3, *faint_texture)
+    sphere = Sphere("sphere", np.array([1.45, 1.5, 0.3]), 0.3, (0.9, 0.5, 0.3))
+    return (floor, fine_wall, coarse_wall, *tall_box, *faint_box, sphere)
 
 
 def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
@@ -90,14 +98,17 @@ def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
     views = []
     for index in range(count):
         across, up, away = (0.5 + index * np.array([0.8191725134, 0.6710436067, 0.5497004779])) % 1.0
-        azimuth, elevation = np.radians(14 + 62 * across), np.radians(12 + 33 * up)
-        outward = np.array(
-            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-        )
+        azimuth = np.radians(14 + 62 * across)
+        elevation = np.radians(12 + 33 * up)
+        x = np.cos(elevation) * np.cos(azimuth)
+        y = np.cos(elevation) * np.sin(azimuth)
+        z = np.sin(elevation)
+        outward = np.array([x, y, z])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         rotation = np.stack([right, np.cross(-outward, right), -outward])
         position = target + (2.3 + 0.6 * away) * outward
-        views.append(View(f"{index:03d}.png", rotation, -rotation @ position, 0.8 * width, width, height))
+        translation = -rotation @ position
+        views.append(View(f"{index:03d}.png", rotation, translation, 0.8 * width, width, height))
     return tuple(views)
 
 
@@ -114,23 +125,24 @@ def describe_scene(
         if value < least:
             raise ValueError(f"the demo scene's {name} is {value}; give at least {least}")
     rng = np.random.default_rng(seed)
-    surfaces, cameras = room_surfaces(), arc_views(views, width, height)
+    surfaces = room_surfaces()
+    cameras = arc_views(views, width, height)
     area = np.array([surface.area for surface in surfaces])
     counts = rng.multinomial(6 * points, area / area.sum())  # enough to drop hidden and unseen places
-    exact = np.concatenate([surface.sample(count, rng) for surface, count in zip(surfaces, counts, strict=True)])
-    colours = np.concatenate(
-        [surface.colour(part) for surface, part in zip(surfaces, np.split(exact, counts.cumsum()[:-1]), strict=True)]
-    )
+    samples = []
+    sample_colours = []
+    for surface, count in zip(surfaces, counts, strict=True):
+        on_surface = surface.sample(count, rng)
+        samples.append(on_surface)
+        sample_colours.append(surface.colour(on_surface))
+    exact = np.concatenate(samples)  # [P, 3]
+    colours = np.concatenate(sample_colours)  # [P, 3]
     tracks = np.stack([visible(surfaces, view, exact) for view in cameras], -1)  # [P, V]
     seen = np.flatnonzero(tracks.sum(1) >= 2)
     kept = np.sort(rng.permutation(seen)[:points])
-    return SceneDescription(
-        surfaces=surfaces,
-        views=cameras,
-        points=exact[kept] + 0.004 * rng.normal(size=(len(kept), 3)),
-        colours=np.rint(255 * colours[kept]).astype(np.uint8),
-        tracks=tracks[kept],
-    )
+    noisy = exact[kept] + 0.004 * rng.normal(size=(len(kept), 3))
+    colours_8_bit = np.rint(255 * colours[kept]).astype(np.uint8)
+    return SceneDescription(surfaces, cameras, noisy, colours_8_bit, tracks[kept])
 
 
 def _write_colmap(scene: SceneDescription, folder: Path) -> None:
@@ -163,7 +175,9 @@ def _refuse_foreign(folder: Path) -> None:
         raise FileExistsError(f"{folder} is a file; name a new or empty folder for the demo scene")
     description = folder / _DESCRIPTION_NAME
     known = description.is_file() and _FORMAT.encode() in description.read_bytes()
-    if folder.exists() and any(folder.iterdir()) and not known:
+    if known or not folder.exists():
+        return
+    if any(folder.iterdir()):
         raise FileExistsError(f"{folder} holds files that are not a demo scene; name a new or empty folder")
 
 
@@ -193,7 +207,8 @@ def write_scene(
     try:
         (partial / "images").mkdir(parents=True)
         for view in scene.views:
-            Image.fromarray(render(scene.surfaces, view)).save(partial / "images" / view.name)
+            image = Image.fromarray(render(scene.surfaces, view))
+            image.save(partial / "images" / view.name)
         _write_colmap(scene, partial / SPARSE_FOLDER)
         description = {"format": _FORMAT, "wavelengths": scene.wavelengths}
         (partial / _DESCRIPTION_NAME).write_text(json.dumps(description, indent=2) + "\n")

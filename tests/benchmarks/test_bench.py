@@ -91,7 +91,8 @@ def test_load_names_the_file(tmp_path: Path):
 
 
 def test_key_changes_with_everything_that_sets_a_run_up():
-    scene, ours = Scene("fox", "fox", "colmap"), Row("ours", "sadgs", {"a": 1})
+    scene = Scene("fox", "fox", "colmap")
+    ours = Row("ours", "sadgs", {"a": 1})
     jobs = [
         Job(scene, ours, 0),
         Job(scene, ours, 1),
@@ -101,7 +102,8 @@ def test_key_changes_with_everything_that_sets_a_run_up():
     ]
     assert len({job.key for job in jobs}) == len(jobs)
     # Which other scenes and seeds a row has is not part of a run.
-    assert Job(scene, dataclasses.replace(ours, seeds=(0,), scenes=("fox",)), 0).key == jobs[0].key
+    actual = Job(scene, dataclasses.replace(ours, seeds=(0,), scenes=("fox",)), 0).key
+    assert actual == jobs[0].key
 
 
 # Overrides
@@ -138,7 +140,9 @@ def test_set_dotted_walks_dataclasses_and_dicts_and_keeps_types():
     }.items():
         set_dotted(config, path, value)
     assert config.inner == Inner(1e-4, Path("b/c"), (3, 4), True)
-    assert (config.groups["means"], config.steps, config.limit) == ({"lr": 2, "scheduler": None}, 20, 5)
+    assert config.groups["means"] == {"lr": 2, "scheduler": None}
+    assert config.steps == 20
+    assert config.limit == 5
 
 
 @pytest.mark.parametrize(
@@ -205,7 +209,8 @@ def test_a_methods_own_settings_of_its_parser_stay(method: str, tmp_path: Path):
     scene = Scene("lego", "lego", "nerfstudio-data", {"downscale_factor": 1})
     config: Any = build_config(scene, Row("ours", method), 0, tmp_path, tmp_path)
     parser = config.pipeline.datamanager.dataparser
-    assert parser.load_3D_points and parser.downscale_factor == 1  # nerfstudio's default reads no points
+    assert parser.load_3D_points, "nerfstudio's default reads no points"
+    assert parser.downscale_factor == 1
 
     from nerfstudio.configs.method_configs import all_methods
 
@@ -269,7 +274,9 @@ def some_jobs(labels: str = "abc") -> list[Job]:
 
 
 def test_results_are_written_and_done_runs_are_skipped(tmp_path: Path):
-    output, log, jobs = tmp_path / "out" / "results.jsonl", tmp_path / "results.log", some_jobs()
+    output = tmp_path / "out" / "results.jsonl"
+    log = tmp_path / "results.log"
+    jobs = some_jobs()
     runner = FakeRunner(crashes={"b"})
     bench.run_all(jobs, runner, lambda r: results.append(output, r), log)
     assert runner.started == [("a", None), ("b", None), ("c", None)]
@@ -278,20 +285,25 @@ def test_results_are_written_and_done_runs_are_skipped(tmp_path: Path):
         ("a", "ok", 1), ("b", "failed", 1), ("c", "ok", 1),
     ]  # fmt: skip
     assert "ended with code 3" in written[1]["error"]
-    assert log.read_text().startswith("=== fox/b/0/") and "what it said" in log.read_text()
+    assert log.read_text().startswith("=== fox/b/0/")
+    assert "what it said" in log.read_text()
 
     todo = bench.unfinished(jobs, written)
     assert [job.row.label for job in todo] == ["b"]
     bench.run_all(todo, FakeRunner(), lambda r: results.append(output, r), log)
-    assert {r["label"]: r["status"] for r in results.read(output)} == {"a": "ok", "b": "ok", "c": "ok"}
+    actual = {r["label"]: r["status"] for r in results.read(output)}
+    expected = {"a": "ok", "b": "ok", "c": "ok"}
+    assert actual == expected
     assert not bench.unfinished(jobs, results.read(output))
 
 
 def test_gpus_are_shared_out(tmp_path: Path):
-    runner, seen = FakeRunner(), []
+    runner = FakeRunner()
+    seen = []
     bench.run_all(some_jobs("abcd"), runner, seen.append, tmp_path / "log", gpus=["0", "1"], jobs_per_gpu=2)
     assert [gpu for _, gpu in runner.started] == ["0", "1", "0", "1"]
-    assert all(r["jobs_per_gpu"] == 2 for r in seen)
+    for r in seen:
+        assert r["jobs_per_gpu"] == 2
 
 
 def test_an_interrupt_ends_the_running_processes(tmp_path: Path):
@@ -336,7 +348,8 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
     monkeypatch.setattr(bench, "launcher", lambda root: launch)
     with pytest.raises(SystemExit) as stopped:
         bench.main(arguments)
-    assert stopped.value.code == 143 and processes[0].poll() is not None
+    assert stopped.value.code == 143
+    assert processes[0].poll() is not None
     assert signal.getsignal(signal.SIGTERM) == before
     monkeypatch.setattr(bench, "launcher", lambda root: FakeRunner(crashes={"ours"}))
     assert bench.main(arguments) == 1
@@ -370,7 +383,8 @@ def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, cap
     results.append(path, result(key="c"))
     assert [r["key"] for r in results.read(path)] == ["a", "c"]
     said = capsys.readouterr().err
-    assert "results.jsonl:2 is not a result" in said and "results.jsonl:3 is not a result" in said
+    assert "results.jsonl:2 is not a result" in said
+    assert "results.jsonl:3 is not a result" in said
 
 
 @pytest.mark.usefixtures("nerfstudio")
@@ -408,7 +422,8 @@ def test_table_means_over_seeds_and_ratio_to_the_reference():
 
 def test_table_takes_the_last_result_and_tells_of_shared_gpus():
     text = markdown([result(psnr=20.0, key="old"), result(psnr=25.0, key="new", jobs_per_gpu=2)])
-    assert "25.00" in text and "20.00" not in text
+    assert "25.00" in text
+    assert "20.00" not in text
     assert text.endswith("- Some runs shared a GPU: their times are not comparable.")
 
 
@@ -416,7 +431,8 @@ def test_table_tells_of_our_runs_of_several_commits():
     commits = ["a" * 40, "b" * 40]
     rows = [result(seed=i, method="sadgs-indoor", versions={"commit": commits[i]}) for i in range(2)]
     told = "- The rows of sadgs are of several commits (aaaaaaa, bbbbbbb);"
-    assert told in markdown(rows) and told not in markdown([{**row, "method": "splatfacto"} for row in rows])
+    assert told in markdown(rows)
+    assert told not in markdown([{**row, "method": "splatfacto"} for row in rows])
 
 
 def test_a_finished_run_is_one_line():
@@ -434,4 +450,5 @@ def test_other_commands_are_told_and_reached(capsys: pytest.CaptureFixture[str])
         printed = capsys.readouterr().out
         assert printed.startswith(f"usage: python -m benchmarks {arguments[0] if len(arguments) == 2 else '['}")
         if len(arguments) == 1:
-            assert all(f"  {name}: " in printed for name in bench.COMMANDS)
+            for name in bench.COMMANDS:
+                assert f"  {name}: " in printed

@@ -58,7 +58,8 @@ def test_models_that_differ_by_a_similarity_are_equal():
     other.transform(SIMILARITY)
     moved = displacement(Observed.of(one), Observed.of(other))
     assert moved.points == one.num_points3D()
-    assert moved.mean < 1e-6 and moved.worst < 1e-6
+    assert moved.mean < 1e-6
+    assert moved.worst < 1e-6
 
 
 def test_points_move_by_as_many_px_as_a_camera_s_principal_point():
@@ -69,7 +70,8 @@ def test_points_move_by_as_many_px_as_a_camera_s_principal_point():
         camera.principal_point_x += 0.3
         camera.principal_point_y -= 0.4
     moved = displacement(Observed.of(one), Observed.of(other))
-    assert moved.mean == pytest.approx(0.5, abs=1e-6) and moved.worst == pytest.approx(0.5, abs=1e-6)
+    assert moved.mean == pytest.approx(0.5, abs=1e-6)
+    assert moved.worst == pytest.approx(0.5, abs=1e-6)
 
 
 def test_the_worst_view_is_the_one_whose_camera_turned():
@@ -83,7 +85,8 @@ def test_the_worst_view_is_the_one_whose_camera_turned():
     (image,) = [image for image in other.images.values() if image.frame_id == frame_id]
     moved = displacement(Observed.of(one), Observed.of(other))
     assert moved.worst_view == image.name
-    assert moved.worst > 0.1 and moved.mean == pytest.approx(moved.worst / one.num_reg_images(), rel=1e-3)
+    assert moved.worst > 0.1
+    assert moved.mean == pytest.approx(moved.worst / one.num_reg_images(), rel=1e-3)
 
 
 def test_models_without_common_photos_are_refused():
@@ -129,9 +132,11 @@ def test_errors_of_true_cameras_are_those_after_a_similarity():
     moved = copy.deepcopy(true)
     moved.transform(SIMILARITY)
     found = camera_truth.errors(moved, true)
-    assert found.centres < 1e-6 and found.rotations < 1e-4
+    assert found.centres < 1e-6
+    assert found.rotations < 1e-4
     start = camera_truth.errors(perturbed, true)
-    assert start.centres > 0.02 and start.rotations > 0.01
+    assert start.centres > 0.02
+    assert start.rotations > 0.01
 
 
 def test_a_rotation_of_a_true_camera_is_its_angle():
@@ -142,7 +147,8 @@ def test_a_rotation_of_a_true_camera_is_its_angle():
         rotation = pycolmap.Rotation3d(np.array([0.0, np.radians(0.5), 0.0])) * frame.rig_from_world.rotation
         frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation * centre))
     found = camera_truth.errors(moved, true)
-    assert found.centres < 1e-6 and found.rotations == pytest.approx(0.5, rel=1e-4)
+    assert found.centres < 1e-6
+    assert found.rotations == pytest.approx(0.5, rel=1e-4)
 
 
 def test_a_robust_adjustment_comes_nearer_to_the_truth_than_squares_if_matches_are_wrong():
@@ -199,7 +205,8 @@ def test_seeds_reach_the_verification_of_matches_and_the_mapper(monkeypatch: pyt
     reconstruct.match(["a.png", "b.png"], database, "exhaustive", None, seed=7)
     with pytest.raises(ValueError, match="no two photos"):
         reconstruct.place_cameras(tmp_path, ["a.png", "b.png"], database, tmp_path / "model", None, seed=7)
-    assert verified == [7] and seeds == [7, 7]
+    assert verified == [7]
+    assert seeds == [7, 7]
 
 
 @pytest.fixture(scope="module")
@@ -224,14 +231,23 @@ def test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed(rows: l
     assert [row["key"] for row in rows] == ["room/new/released", "room/new/squared"]
     for row in rows:
         assert row["status"] == "ok", row["error"]
-        assert row["seeds"] == [0, 1] and row["registered"] == [VIEWS, VIEWS] and row["photos"] == VIEWS
+        assert row["seeds"] == [0, 1]
+        assert row["registered"] == [VIEWS, VIEWS]
+        assert row["photos"] == VIEWS
         (pair,) = row["pairs"]
-        assert pair["seeds"] == [0, 1] and 0 <= pair["mean"] <= pair["worst"] < 1 and pair["points"] > 100
-        assert all(0 < errors["median"] < errors["mean"] < 2 for errors in row["left_out"])
-        assert all({*stages} == {"features", "matches", "cameras", "adjustment"} for stages in row["seconds"])
-        assert row["cores"] >= 1 and row["versions"]["pycolmap"] == pycolmap.__version__
+        assert pair["seeds"] == [0, 1]
+        assert 0 <= pair["mean"] <= pair["worst"] < 1
+        assert pair["points"] > 100
+        for errors in row["left_out"]:
+            assert 0 < errors["median"] < errors["mean"] < 2
+        for stages in row["seconds"]:
+            assert {*stages} == {"features", "matches", "cameras", "adjustment"}
+        assert row["cores"] >= 1
+        assert row["versions"]["pycolmap"] == pycolmap.__version__
     released, squared = rows
-    assert [errors["count"] for errors in released["left_out"]] == [errors["count"] for errors in squared["left_out"]]
+    actual = [errors["count"] for errors in released["left_out"]]
+    expected = [errors["count"] for errors in squared["left_out"]]
+    assert actual == expected
     assert released["left_out"] != squared["left_out"]
 
 
@@ -245,7 +261,8 @@ def test_seeds_share_matches_and_verify_them_anew(rows: list[dict[str, Any]], ro
         read.append(([found.tolist() for found in matches], inliers))
     (matches, inliers), first, second = read
     assert first == (matches, inliers), "the same seed finds the same inliers"
-    assert second[0] == matches and second[1] != inliers
+    assert second[0] == matches
+    assert second[1] != inliers
 
 
 def test_the_table_has_a_line_for_each_variant(rows: list[dict[str, Any]]):
@@ -326,8 +343,10 @@ def test_a_capture_that_ends_without_rows_is_a_failed_one_and_what_is_done_is_no
     command = cameras.Command(CONFIG, tmp_path, output, "new", seeds=(3,), only=only, variant=("released",))
     assert command() == 1
     done, failed = results.read(output)
-    assert done["key"] == "no-wrong/new/released" and done["seeds"] == [3]
-    assert failed["status"] == "failed" and "code 1 and no rows" in failed["error"]
+    assert done["key"] == "no-wrong/new/released"
+    assert done["seeds"] == [3]
+    assert failed["status"] == "failed"
+    assert "code 1 and no rows" in failed["error"]
     command()
     assert started == ["no-wrong", "few-wrong", "few-wrong"]
     cameras.Command(CONFIG, tmp_path, output, "new", seeds=(3, 4), only=("no-wrong",), variant=("released",))()

@@ -18,9 +18,11 @@ def looking(*poses: tuple[float, float]) -> Views:
     viewmats, K = camera()
     viewmats = viewmats.repeat(len(poses), 1, 1)
     for viewmat, (degrees, aside) in zip(viewmats, poses, strict=True):
-        angle, centre = torch.tensor(degrees).deg2rad(), torch.tensor([0.0, 0.0, DEPTH])
+        angle = torch.tensor(degrees).deg2rad()
+        centre = torch.tensor([0.0, 0.0, DEPTH])
         viewmat[0, 0] = viewmat[2, 2] = angle.cos()
-        viewmat[0, 2], viewmat[2, 0] = angle.sin(), -angle.sin()
+        viewmat[0, 2] = angle.sin()
+        viewmat[2, 0] = -angle.sin()
         viewmat[:3, 3] = centre - viewmat[:3, :3] @ centre - torch.tensor([aside, 0.0, 0.0])
     return Views(viewmats, K.expand(len(poses), 3, 3), torch.tensor([[64, 48]]).expand(len(poses), 2))
 
@@ -38,13 +40,17 @@ def test_the_angle_is_that_to_the_nearest_training_view_that_shares_points():
     # The training view of 2 degrees looks elsewhere.
     training = looking((20.0, 0.0), (-7.0, 0.0), (90.0, 0.0), (2.0, 50.0))
     angles = nearest_angles(looking((0.0, 0.0), (30.0, 0.0)), training, square())
-    torch.testing.assert_close(angles, torch.tensor([7.0, 10.0]), atol=0.05, rtol=0)
+    expected = torch.tensor([7.0, 10.0])
+    torch.testing.assert_close(angles, expected, atol=0.05, rtol=0)
     assert nearest_angles(HERE, HERE, square()).item() == 0
-    assert nearest_angles(HERE, looking((180.0, 0.0)), square()).item() == pytest.approx(180, abs=2)
+    actual = nearest_angles(HERE, looking((180.0, 0.0)), square()).item()
+    expected = pytest.approx(180, abs=2)
+    assert actual == expected
 
 
 def test_views_that_share_too_few_points_have_no_angle():
-    few, behind = square()[:9], square(-DEPTH)
+    few = square()[:9]
+    behind = square(-DEPTH)
     for points in (few, behind, torch.cat([few, behind]), square(reach=100), torch.empty(0, 3)):
         assert nearest_angles(HERE, looking((5.0, 0.0)), points).isnan().all()
 
@@ -53,4 +59,5 @@ def test_finite_points_are_thinned_evenly():
     points = torch.arange(3.0 * (4 * MAX_POINTS + 1)).view(-1, 3)
     points[1] = torch.inf
     finite = points[points.isfinite().all(dim=-1)]
-    assert torch.equal(thinned(points[:9]), finite[:8]) and torch.equal(thinned(points), finite[::4])
+    assert torch.equal(thinned(points[:9]), finite[:8])
+    assert torch.equal(thinned(points), finite[::4])

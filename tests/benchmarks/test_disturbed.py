@@ -30,7 +30,8 @@ CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 
 
 def write_copy(scene: Path, out: Path, *options: str) -> Path:
-    assert bench.main(["disturbed", str(scene.parent), str(out), *options]) == 0
+    status = bench.main(["disturbed", str(scene.parent), str(out), *options])
+    assert status == 0
     return out / scene.name
 
 
@@ -66,7 +67,8 @@ def test_thirty_percent_of_the_training_photos_are_chosen_and_at_least_one(train
     clean = names[5::7]
     chosen = choose(names, clean, generator_of(0, "scene"))
     assert len(chosen) == len({*chosen}) == expected
-    assert chosen == sorted(chosen) and not {*chosen} & {*clean}
+    assert chosen == sorted(chosen)
+    assert not {*chosen} & {*clean}
 
 
 def test_a_copy_disturbs_as_many_photos_as_it_has_to_and_only_those_of_training(scene: Path, copy: Path):
@@ -130,11 +132,13 @@ def test_each_photo_has_one_to_three_things_that_cover_3_to_15_percent_of_it():
     shares = []
     for seed in range(60):
         result, covered, names = disturb(photo, things, np.random.default_rng(seed))
-        np.testing.assert_array_equal(covered, (result != photo).any(axis=-1))
+        expected = (result != photo).any(axis=-1)
+        np.testing.assert_array_equal(covered, expected)
         numbers.add(len(names))
         shares.append(covered.mean())
     assert numbers == {1, 2, 3}
-    assert 0.03 <= min(shares) < 0.05 and 0.11 < max(shares) <= 0.15
+    assert 0.03 <= min(shares) < 0.05
+    assert 0.11 < max(shares) <= 0.15
 
 
 @pytest.mark.parametrize("level", [0, 255])
@@ -163,9 +167,12 @@ def test_a_photo_into_which_nothing_fits_is_named(scene: Path, tmp_path: Path, c
     (small / "sparse").symlink_to(scene / "sparse")
     for name in names_of(scene):
         Image.new("RGB", (2, 2)).save(small / "images" / name)
-    assert bench.main(["disturbed", str(small.parent), str(tmp_path / "copies")]) == 2
+    status = bench.main(["disturbed", str(small.parent), str(tmp_path / "copies")])
+    assert status == 2
     error = capsys.readouterr().err
-    assert "do not fit into 2 × 2 px" in error and str(small / "images") in error and error.count("\n") == 1
+    assert "do not fit into 2 × 2 px" in error
+    assert str(small / "images") in error
+    assert error.count("\n") == 1
     assert not [*(tmp_path / "copies").iterdir()]
 
 
@@ -176,7 +183,8 @@ def test_the_same_seed_writes_the_same_copy_and_another_one_another(scene: Path,
     again = write_copy(scene, tmp_path / "again")
     other = write_copy(scene, tmp_path / "other", "--seed", "1")
     written = sorted(path.relative_to(copy) for path in copy.rglob("*") if path.is_file())
-    assert written == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
+    expected = sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
+    assert written == expected
     for name in written:
         assert (copy / name).read_bytes() == (again / name).read_bytes()
     assert disturbed_photos(other) != disturbed_photos(copy)
@@ -190,11 +198,15 @@ def test_a_copy_does_not_depend_on_the_other_scenes_and_replaces_an_earlier_one(
     for name in ("another", scene.name):
         (root / name).symlink_to(scene)
     out = tmp_path / "copies"
-    assert bench.main(["disturbed", str(root), str(out), "--seed", "1"]) == 0
+    status = bench.main(["disturbed", str(root), str(out), "--seed", "1"])
+    assert status == 0
     assert bench.main(["disturbed", str(root), str(out)]) == 0
-    assert sorted(path.name for path in out.iterdir()) == sorted(["another", scene.name])
+    actual = sorted(path.name for path in out.iterdir())
+    expected = sorted(["another", scene.name])
+    assert actual == expected
     assert disturbed_photos(out / scene.name) == disturbed_photos(copy) != disturbed_photos(out / "another")
-    assert bench.main(["disturbed", str(root), str(tmp_path / "one"), "--only", "another"]) == 0
+    status = bench.main(["disturbed", str(root), str(tmp_path / "one"), "--only", "another"])
+    assert status == 0
     assert [path.name for path in (tmp_path / "one").iterdir()] == ["another"]
 
 
@@ -208,17 +220,20 @@ def test_an_outline_is_moved_to_the_edge_of_the_thing(tmp_path: Path):
     Image.fromarray(np.uint8(np.asarray(image) + noise)).save(tmp_path / "photo.png")
     outline = Outline("photo.png", ((77, 57), (163, 56), (162, 143), (84, 144)))
     thing = cut_out(tmp_path, outline)
-    assert thing.pixels.shape == (80, 80, 4) and thing.area == 80 * 80
+    assert thing.pixels.shape == (80, 80, 4)
+    assert thing.area == 80 * 80
     assert thing.pixels[..., 2].min() > 100  # The square is blue, and its surroundings are cut away.
     assert thing.pixels[..., 0].max() < 100
 
 
 def test_photos_to_cut_out_are_read_only_if_they_are_given(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert {thing.name.split()[1] for thing in all_cut_outs(None)} == {"person", "car"}
+    actual = {thing.name.split()[1] for thing in all_cut_outs(None)}
+    assert actual == {"person", "car"}
     for thing, is_high in ((draw_person("#b03030", "#28324a"), True), (draw_car("#2d5fa8"), False)):
         height, width = thing.pixels.shape[:2]
         assert (height > width) == is_high
-        assert {*np.unique(thing.pixels[..., 3])} == {0, 255} and thing.area > height * width / 3
+        assert {*np.unique(thing.pixels[..., 3])} == {0, 255}
+        assert thing.area > height * width / 3
     (tmp_path / "plush").mkdir()
     with pytest.raises(ValueError, match=r"plush/0007\.jpg cannot be read; give the folder that holds plush and mouse"):
         all_cut_outs(tmp_path)
@@ -233,7 +248,8 @@ def test_photos_to_cut_out_are_read_only_if_they_are_given(tmp_path: Path, capsy
 def parser_of(label: str, copy: Path, work: Path) -> Any:
     """The parser of a row of the protocol, for a copy in the place of fox."""
     rows = protocol.load(CONFIGS / "disturbed.yaml")
-    (job,) = [job for job in rows.jobs() if (job.scene.name, job.row.label, job.seed) == ("fox", label, 0)]
+    jobs = {(job.scene.name, job.row.label, job.seed): job for job in rows.jobs()}
+    job = jobs["fox", label, 0]
     root = work / "copies"
     root.mkdir()
     (root / "fox").symlink_to(copy)
@@ -274,7 +290,8 @@ def test_the_protocol_of_cameras_has_clean_and_disturbed_photos_of_the_same_scen
     expected = {}
     for scene in scenes:
         expected |= {scene: f"{scene}/images", f"{scene}-disturbed": f"{scene}/disturbed"}
-    assert captures == expected and len(scenes) == 5
+    assert captures == expected
+    assert len(scenes) == 5
 
 
 # Wrong input
@@ -299,5 +316,8 @@ def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
     ):
         assert bench.main(["disturbed", *arguments]) == 2
         error = capsys.readouterr().err
-        assert sentence in error and error.count("\n") == 1
-    assert (out / scene.name / "kept").exists() and (scene / "images").is_dir() and not Path(new).exists()
+        assert sentence in error
+        assert error.count("\n") == 1
+    assert (out / scene.name / "kept").exists()
+    assert (scene / "images").is_dir()
+    assert not Path(new).exists()

@@ -12,7 +12,8 @@ import yaml
 from benchmarks import __main__ as bench
 from benchmarks import documents, plots
 
-OPENING, CLOSING = "<!-- table: {} -->", "<!-- end -->"
+OPENING = "<!-- table: {} -->"
+CLOSING = "<!-- end -->"
 SWEEP = {
     "kind": "sweep",
     "rows": ["sweep.jsonl"],
@@ -132,7 +133,8 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
     tables = {"claims": {"kind": "changes", "header": ["Claim", "Paper"], "remark": "Explanation", "lines": lines}}
     folder = checkout(tmp_path, tables, {"sweep.jsonl": rows})
     assert bench.main(["documents", str(folder)]) == 0
-    assert (folder / "README.md").read_text("utf8").splitlines()[4:10] == [
+    actual = (folder / "README.md").read_text("utf8").splitlines()[4:10]
+    expected = [
         "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Spread | Scenes × seeds | Explanation |",
         "| --- | --- | --- | --- | --- | --- |",
         "| × 2 | theirs | −1.00 to −.25 / .0000 to +.0100 / −.0100 to .0000 / ×1.00 to 1.50 | .25 / .0000 / .0000 "
@@ -141,6 +143,7 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
         "| nothing | theirs | not measured | – | – | no run |",
         "| without LPIPS |  | +1.00 / .0000 / – / ×1.00 | – | 1 × 1 | why |",
     ]
+    assert actual == expected
 
 
 FIGURE = {
@@ -159,7 +162,8 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
         described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": FIGURE}}, sort_keys=False), "utf8"
     )
     path = folder / documents.FIGURES / "peers.png"
-    assert bench.main(["documents", str(folder), "--check"]) == 1 and not path.exists()
+    assert bench.main(["documents", str(folder), "--check"]) == 1
+    assert not path.exists()
     assert bench.main(["documents", str(folder)]) == 0
     digest = plots.digest_in(path)
     assert bench.main(["documents", str(folder), "--check"]) == 0
@@ -167,10 +171,13 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
     rows.write_text(rows.read_text("utf8").replace("250.0", "251.0"), "utf8")
     written = path.read_bytes()
     capsys.readouterr()
-    assert bench.main(["documents", str(folder), "--check"]) == 1 and path.read_bytes() == written
+    assert bench.main(["documents", str(folder), "--check"]) == 1
+    assert path.read_bytes() == written
     assert f"{path} is not what its rows give; run python -m benchmarks documents." in capsys.readouterr().out
-    assert bench.main(["documents", str(folder)]) == 0 and path.read_bytes() != written
-    assert digest is not None and plots.digest_in(path) not in (digest, None)
+    assert bench.main(["documents", str(folder)]) == 0
+    assert path.read_bytes() != written
+    assert digest is not None
+    assert plots.digest_in(path) not in (digest, None)
 
 
 WRONG_FIGURES: dict[str, tuple[Any, str]] = {
@@ -197,8 +204,10 @@ def test_a_figure_that_is_described_wrongly_is_one_sentence(
     )
     assert bench.main(["documents", str(folder)]) == 2
     error = capsys.readouterr().err
-    assert sentence in error and error.count("\n") == 1
-    assert not (folder / documents.FIGURES).exists() and "fox" not in (folder / "README.md").read_text("utf8")
+    assert sentence in error
+    assert error.count("\n") == 1
+    assert not (folder / documents.FIGURES).exists()
+    assert "fox" not in (folder / "README.md").read_text("utf8")
 
 
 def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -250,7 +259,9 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
     before = (folder / "README.md").read_text("utf8")
     assert bench.main(["documents", str(folder)]) == 2
     error = capsys.readouterr().err
-    assert error.startswith("python -m benchmarks documents: ") and sentence in error and error.count("\n") == 1
+    assert error.startswith("python -m benchmarks documents: ")
+    assert sentence in error
+    assert error.count("\n") == 1
     assert (folder / "README.md").read_text("utf8") == before
 
 

@@ -36,7 +36,8 @@ def entry(value: float, direction: str, tolerance: float) -> dict[str, Any]:
 @pytest.fixture
 def baseline(tmp_path: Path) -> Path:
     path = tmp_path / "baseline.json"
-    psnr, count = entry(30.0, "higher", 0.5), entry(1000, "near", 50)
+    psnr = entry(30.0, "higher", 0.5)
+    count = entry(1000, "near", 50)
     path.write_text(json.dumps({"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}}))
     return path
 
@@ -63,7 +64,8 @@ def test_means_over_seeds_are_compared(baseline: Path):
 
 def test_a_regression_names_row_metric_move_and_tolerance(baseline: Path):
     worse = result(job(), lpips=0.2, gaussians=900)
-    assert gate.regressions(gate.read(baseline), [job()], [worse]) == [
+    actual = gate.regressions(gate.read(baseline), [job()], [worse])
+    assert actual == [
         "fox/ours: lpips moved by +0.1, from 0.1 to 0.2; tolerance 0.01 (lower is better).",
         "fox/ours: gaussians moved by -100, from 1000 to 900; tolerance 50 (either way).",
     ]
@@ -153,7 +155,8 @@ def test_rows_that_nothing_judges_are_told(command: Any, baseline: Path, capsys:
     baseline.write_text(baseline.read_text().replace("fox/ours", "fox/theirs"))
     assert command("--gate", str(baseline)) == 1
     said = capsys.readouterr().out
-    assert "fox/theirs is missing from the results" in said and "fox/ours is not in the baseline" in said
+    assert "fox/theirs is missing from the results" in said
+    assert "fox/ours is not in the baseline" in said
 
 
 def test_a_wrong_baseline_is_told_before_anything_runs(

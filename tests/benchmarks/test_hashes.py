@@ -41,7 +41,9 @@ def test_a_view_has_the_hash_of_its_values():
 
 def test_tensors_are_found_in_nested_values_and_others_are_left_out():
     found = tensors_in({"a": [torch.ones(1), {"b": torch.zeros(2)}], "rate": 0.1, "name": "c"})
-    assert {name: value.tolist() for name, value in found.items()} == {"a.0": [1.0], "a.1.b": [0.0, 0.0]}
+    actual = {name: value.tolist() for name, value in found.items()}
+    expected = {"a.0": [1.0], "a.1.b": [0.0, 0.0]}
+    assert actual == expected
 
 
 def test_a_checkpoint_s_plan_and_options_do_not_enter_its_hashes():
@@ -54,6 +56,10 @@ def test_a_checkpoint_s_plan_and_options_do_not_enter_its_hashes():
         }
         return {"step": 3, "pipeline": pipeline, "optimizers": {"means": {"state": {0: {"exp_avg": torch.ones(1)}}}}}
 
-    one, other = ({name: hash_tensors(v) for name, v in groups_of(checkpoint(o)).items()} for o in ("old", "new"))
+    def hashes_of(option: str) -> dict[str, str]:
+        return {name: hash_tensors(tensors) for name, tensors in groups_of(checkpoint(option)).items()}
+
+    one = hashes_of("old")
+    other = hashes_of("new")
     assert one == other
     assert set(groups_of(checkpoint("old"))["strategy"]) == {"n_total"}

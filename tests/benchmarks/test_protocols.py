@@ -21,9 +21,9 @@ from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
-OF_PHOTOS = ("chain", "disturbed-cameras", "placing", "seconds")
-"""Protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
-PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OF_PHOTOS)
+OTHERS = ("captures", "chain", "disturbed-cameras", "placing", "seconds")
+"""The description of the captures, and protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
+PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OTHERS)
 OPTIONS = {"colmap_path": "sparse/0", "downscale_factor": 4}
 
 
@@ -61,7 +61,8 @@ def colmap_scene(
     (folder / "sparse/0").mkdir(parents=True)
     for name in names:
         Image.new("RGB", size).save(folder / images / name)
-    pose, points = (np.array([1.0, 0, 0, 0]), np.zeros(3)), (np.zeros((1, 2)), np.array([-1]))
+    pose = (np.array([1.0, 0, 0, 0]), np.zeros(3))
+    points = (np.zeros((1, 2)), np.array([-1]))
     views = {i: colmap.Image(i, *pose, 1, name, *points) for i, name in enumerate(names, 1)}
     cameras = {1: colmap.Camera(1, "PINHOLE", 16, 12, np.array([10.0, 10.0, 8.0, 6.0]))}
     colmap.write_model(cameras, views, {}, str(folder / "sparse/0"), ext=".txt" if text else ".bin")
@@ -94,26 +95,25 @@ def test_table_1_has_the_settings_of_the_paper(name: str, tmp_path: Path):
         assert {scene for scene, label in built if label == ours} == set(load(name).scenes)
     for (scene, label), config in built.items():
         parser = config.pipeline.datamanager.dataparser
-        assert (parser.eval_mode, parser.eval_interval, parser.colmap_path) == ("interval", 8, Path("sparse/0"))
+        assert parser.eval_mode == "interval"
+        assert parser.eval_interval == 8
+        assert parser.colmap_path == Path("sparse/0")
         indoor = scene in {"room", "counter", "kitchen", "bonsai"}
         assert parser.downscale_factor == {"mipnerf360": 2 if indoor else 4}.get(name, 1)
         if label == "sadgs-paper":
             assert config.pipeline.views_per_iteration == (2 if indoor or name == "deep-blending" else 1)
             assert config.max_num_iterations == (7000 if name == "tanks-and-temples" else 3000)
         if label == "sadgs":
-            assert (config.max_num_iterations, config.pipeline.views_per_iteration) == (None, None), "derived"
+            assert config.max_num_iterations is None, "derived"
+            assert config.pipeline.views_per_iteration is None, "derived"
         if label.startswith("sadgs"):
             assert config.pipeline.model.strategy.tau_split == 0.8
-    assert (
-        set(load(name).scenes)
-        == {
-            "mipnerf360": {
-                *["bicycle", "flowers", "garden", "stump", "treehill", "room", "counter", "kitchen", "bonsai"]
-            },
-            "deep-blending": {"drjohnson", "playroom"},
-            "tanks-and-temples": {"train", "truck"},
-        }[name]
-    )
+    expected = {
+        "mipnerf360": {*["bicycle", "flowers", "garden", "stump", "treehill", "room", "counter", "kitchen", "bonsai"]},
+        "deep-blending": {"drjohnson", "playroom"},
+        "tanks-and-temples": {"train", "truck"},
+    }[name]
+    assert set(load(name).scenes) == expected
 
 
 @pytest.mark.parametrize(
@@ -162,7 +162,8 @@ def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
         **{run: {f"{strategy}.max_gaussians": cap} for run, cap in caps.items()},
     }
     ours = [row for row in load("ablations").rows if row.method.startswith("sadgs")]
-    assert {(scene, row.label): row.overrides for row in ours for scene in row.scenes or ()} == changes
+    actual = {(scene, row.label): row.overrides for row in ours for scene in row.scenes or ()}
+    assert actual == changes
     for scene, label in changes:
         paper = "sadgs-paper-indoor" if scene in ("bonsai", "fox") else "sadgs-paper"
         assert built[scene, label].method_name == ("sadgs" if label.startswith("sadgs") else paper)
@@ -171,7 +172,8 @@ def test_each_ablation_changes_one_thing_of_the_full_method(tmp_path: Path):
 def test_the_progressive_ablation_begins_with_splatfacto_and_another_schedule_of_positions(tmp_path: Path):
     built = configs("ablations", tmp_path)
     for scene in ("bonsai", "fox", "south-half"):
-        base, schedule = (built[scene, label] for label in ("base", "+ schedule"))
+        base = built[scene, "base"]
+        schedule = built[scene, "+ schedule"]
         assert base.method_name == schedule.method_name == "splatfacto"
         assert base.max_num_iterations == schedule.max_num_iterations == 3000
         steps = [config.optimizers["means"]["scheduler"].max_steps for config in (base, schedule)]
@@ -192,7 +194,8 @@ def test_the_derived_schedule_is_measured_on_all_eight_scenes(tmp_path: Path):
         assert config.rates_follow_views
         efforts.setdefault(scene, set()).add(config.pipeline.effort)
     assert set(efforts) == {"bonsai", "fox", "room", "castle", "tree", "south", "site", "lego"}
-    assert all(of_scene == {0.5, 1.0, 2.0, 4.0} for of_scene in efforts.values())
+    for of_scene in efforts.values():
+        assert of_scene == {0.5, 1.0, 2.0, 4.0}
 
 
 def test_defaults_are_chosen_on_validation_views_and_the_main_table_is_of_test_views():
@@ -208,8 +211,10 @@ def test_the_main_table_has_three_seeds_of_ours_beside_splatfacto():
         seeds.setdefault((made.row.label, made.scene.name), []).append(made.seed)
     for scene in load("ours").scenes:
         assert seeds["sadgs", scene] == [0, 1, 2]
-        assert seeds["splatfacto", scene] == ([0, 1, 2] if scene in ("castle", "fox", "tree") else [0])
-        assert all(seeds[label, scene] == [0] for label in ("splatfacto-3k", "effort 0.5", "effort 4"))
+        expected = [0, 1, 2] if scene in ("castle", "fox", "tree") else [0]
+        assert seeds["splatfacto", scene] == (expected)
+        for label in ("splatfacto-3k", "effort 0.5", "effort 4"):
+            assert seeds[label, scene] == [0]
 
 
 def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:
@@ -218,18 +223,25 @@ def content(*rows: dict[str, Any], **changes: Any) -> dict[str, Any]:
 
 
 def test_rows_of_different_scenes_may_share_a_label():
-    fox, south = ({"label": "full", "method": "sadgs", "scenes": [name]} for name in ("fox", "south"))
+    fox = {"label": "full", "method": "sadgs", "scenes": ["fox"]}
+    south = {"label": "full", "method": "sadgs", "scenes": ["south"]}
     jobs = protocol.parse(content(fox, south, seeds=[0])).jobs()
-    assert [(job.scene.name, job.row.label) for job in jobs] == [("fox", "full"), ("south", "full")]
+    actual = [(job.scene.name, job.row.label) for job in jobs]
+    expected = [("fox", "full"), ("south", "full")]
+    assert actual == expected
     with pytest.raises(ValueError, match="two rows have the label 'full' for south"):
         protocol.parse(content(south, {"label": "full", "method": "sadgs"}))
 
 
 def test_the_source_is_text_and_changes_no_key():
     row = {"label": "full", "method": "sadgs"}
-    with_source, without = protocol.parse(content(row, source="the moon")), protocol.parse(content(row))
-    assert (with_source.source, without.source) == ("the moon", None)
-    assert [job.key for job in with_source.jobs()] == [job.key for job in without.jobs()]
+    with_source = protocol.parse(content(row, source="the moon"))
+    without = protocol.parse(content(row))
+    assert with_source.source == "the moon"
+    assert without.source is None
+    actual = [job.key for job in with_source.jobs()]
+    expected = [job.key for job in without.jobs()]
+    assert actual == expected
     with pytest.raises(ValueError, match="source must be text, not 3"):
         protocol.parse(content(row, source=3))
 
@@ -282,7 +294,9 @@ def test_the_command_says_what_is_missing_before_it_runs_anything(tmp_path: Path
     command = [str(CONFIGS / "mipnerf360.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
     assert bench.main(command) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"{tmp_path / 'bicycle'} does not exist" in said and "360_v2" in said
+    assert said.count("\n") == 1
+    assert f"{tmp_path / 'bicycle'} does not exist" in said
+    assert "360_v2" in said
     assert not output.parent.exists()
 
 

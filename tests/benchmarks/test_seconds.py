@@ -37,7 +37,8 @@ def test_parts_are_named_after_their_process_and_last_until_the_next_mark():
         event(2, 9.0, "loop ends"),
         event(2, 9.5, "training ends", gaussians=5),
     ]
-    assert seconds.parts_of(lines, "sadgs", START) == [
+    actual = seconds.parts_of(lines, "sadgs", START)
+    expected = [
         Part("sadgs", "cameras", 0.25, 3.0),
         Part("training", "imports", 0.5, 2.0),
         Part("training", "data and model", 2.0, 5.0),
@@ -45,6 +46,7 @@ def test_parts_are_named_after_their_process_and_last_until_the_next_mark():
         Part("training", "iterations", 6.0, 9.0),
         Part("training", "saving", 9.0, 9.5),
     ]
+    assert actual == expected
 
 
 def row(number: int, total: float, parts: list[list[Any]], **fields: Any) -> dict[str, Any]:
@@ -58,7 +60,8 @@ def test_the_table_has_medians_of_the_parts_that_all_runs_have():
         row(1, 5.0, [["COLMAP", "features", 1.0, 2.0], ["COLMAP", "placing", 2.0, 3.0], ["COLMAP", "placing", 4, 5.0]]),
         row(2, 6.0, [["COLMAP", "placing", 3.0, 6.0], ["COLMAP", "features", 1.5, 3.0]]),
     ]
-    assert seconds_table.median_parts(rows) == [Part("COLMAP", "features", 1.0, 3.0), Part("COLMAP", "placing", 3.0, 6)]
+    expected = [Part("COLMAP", "features", 1.0, 3.0), Part("COLMAP", "placing", 3.0, 6)]
+    assert seconds_table.median_parts(rows) == expected
     assert seconds_table.markdown(rows).splitlines()[2:] == [
         "| fox | new | COLMAP | features | 1.00 | 3.00 | 2.00 |",
         "| fox | new | COLMAP | placing | 3.00 | 6.00 | 3.00 |",
@@ -98,10 +101,13 @@ def test_the_parts_of_a_command_are_measured_once(tmp_path: Path, capsys: pytest
     assert measure() == 0, capsys.readouterr().err
     (measured,) = results.read(tmp_path / "rows.jsonl")
     names = [(process, name) for process, name, _, _ in measured["parts"]]
-    assert measured["photos"] == VIEWS // 2 and measured["cpu_seconds"] > 0.5
-    assert names[0] == ("sadgs-process", "photos") and names[-1] == ("sadgs-process", "publishing")
+    assert measured["photos"] == VIEWS // 2
+    assert measured["cpu_seconds"] > 0.5
+    assert names[0] == ("sadgs-process", "photos")
+    assert names[-1] == ("sadgs-process", "publishing")
     assert {name for process, name in names if process == "COLMAP"} >= {"imports", "features", "placing"}
-    assert all(0 <= begin <= end <= measured["seconds"] for _, _, begin, end in measured["parts"])
+    for _, _, begin, end in measured["parts"]:
+        assert 0 <= begin <= end <= measured["seconds"]
     assert (tmp_path / "plots" / "corner-new.png").exists()
     written = (tmp_path / "rows.jsonl").read_bytes()
     assert measure() == 0  # There is nothing left to do.
@@ -115,7 +121,8 @@ def test_a_command_that_fails_has_a_row_and_its_output_a_log(tmp_path: Path, cap
         Image.new("RGB", (64, 64), (9 * i, 0, 0)).save(tmp_path / "corner" / f"{i}.png")
     assert command(tmp_path, runs=1, cameras=True)() == 1
     (failed,) = results.read(tmp_path / "rows.jsonl")
-    assert failed["status"] == "failed" and "sadgs-process ended with code" in failed["error"]
+    assert failed["status"] == "failed"
+    assert "sadgs-process ended with code" in failed["error"]
     assert "no two photos could be related" in (tmp_path / "rows.log").read_text()
 
 

@@ -31,12 +31,14 @@ def test_without_a_gpu_one_sentence_says_what_it_needs(
     monkeypatch.chdir(tmp_path)
     assert bench.main(["step"]) == 2
     told = "python -m benchmarks step: this needs a CUDA device, and torch finds none.\n"
-    assert capsys.readouterr() == ("", told) and not list(tmp_path.iterdir())
+    assert capsys.readouterr() == ("", told)
+    assert not list(tmp_path.iterdir())
 
 
 def plan(step: Step) -> dict[str, float]:
     """Bytes of all that a step has at its peak in each phase, as the memory plan counts them."""
-    n, size = len(step.params["means"]), StepSize.of([step.info])
+    n = len(step.params["means"])
+    size = StepSize.of([step.info])
     kept = kept_bytes(step.params, step.state) * n + step.images.numel() + step.structure_tensors.numel()  # type: ignore[arg-type]
     return {name: kept + value for name, value in step_bytes(n, size, step.images.device).items()}
 
@@ -48,11 +50,15 @@ def test_a_step_goes_through_the_phases_of_the_plan_and_has_their_size():
     step(phases.append)
     assert phases == list(step_bytes(0, StepSize(), CPU))
     size = StepSize.of([step.info])
-    assert (size.views, size.pixels) == (2, 2 * 40 * 30) and size.pairs > 400
+    assert size.views == 2
+    assert size.pixels == 2 * 40 * 30
+    assert size.pairs > 400
     assert not torch.equal(step.params["means"], before)
-    assert step.state["n_total"].sum() > 0 and step.state["absgrad2d"].sum() > 0
+    assert step.state["n_total"].sum() > 0
+    assert step.state["absgrad2d"].sum() > 0
     kept = 200 * (4 * 4 * 59 + 4 * 13) + 2 * 2 * 3 * 40 * 30
-    assert plan(step) == {name: kept + value for name, value in step_bytes(200, size, CPU).items()}
+    expected = {name: kept + value for name, value in step_bytes(200, size, CPU).items()}
+    assert plan(step) == expected
 
 
 def test_the_parts_of_a_step_can_be_called_alone():
@@ -60,7 +66,8 @@ def test_the_parts_of_a_step_can_be_called_alone():
         step = Step(200, 40, 30, 1, CPU)
     for part in (step, step.render, step.compare, step.observe, step.optimize):
         part()
-    assert step.params["means"].grad is not None and step.rendered.grad is not None
+    assert step.params["means"].grad is not None
+    assert step.rendered.grad is not None
 
 
 def test_the_forward_projection_can_be_called_alone(monkeypatch: pytest.MonkeyPatch):
@@ -72,13 +79,15 @@ def test_the_forward_projection_can_be_called_alone(monkeypatch: pytest.MonkeyPa
         with steps.kernels.triton_switched(triton):
             radii, means2d, _, _ = step.project()
         drawn.append(steps.gsplat_compat.drawn(radii, means2d))
-    assert drawn[0].any() and (drawn[0] != drawn[1]).sum() <= 1
+    assert drawn[0].any()
+    assert (drawn[0] != drawn[1]).sum() <= 1
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="peaks are measured on CUDA")
 @pytest.mark.parametrize("views", [1, 4])
 def test_the_plan_is_near_the_peaks(views: int):
-    step, peaks = Step(300_000, 1732, 1155, views), []
+    step = Step(300_000, 1732, 1155, views)
+    peaks = []
 
     def note(phase: str) -> None:
         peaks.append(torch.cuda.max_memory_allocated())

@@ -41,12 +41,15 @@ def test_the_command_prints_the_table_and_draws_a_plot(tmp_path: Path, capsys: p
         result(scene="south & west", label="broken", status="failed", error="RuntimeError: out of <memory>."),
     ]  # fmt: skip
     lines = write_lines(tmp_path / "r.jsonl", rows)
-    assert bench.main(["table", lines, "--reference", "b", "--plots", str(tmp_path / "out")]) == 0
+    status = bench.main(["table", lines, "--reference", "b", "--plots", str(tmp_path / "out")])
+    assert status == 0
     printed = capsys.readouterr().out
-    assert "| fox | a | 20.0, 21.0 | 0.102 | – | 30.00, 31.00 | – | – |" in printed and "| _hidden |" in printed
+    assert "| fox | a | 20.0, 21.0 | 0.102 | – | 30.00, 31.00 | – | – |" in printed
+    assert "| _hidden |" in printed
     assert "- south & west, broken, seed 0 failed: RuntimeError: out of <memory>.\n" in printed
     with Image.open(tmp_path / "out" / "quality-time.png") as image:
-        assert image.format == "PNG" and image.width == round(7.2 * 200)
+        assert image.format == "PNG"
+        assert image.width == round(7.2 * 200)
 
 
 def measured(seed: int, *points: tuple[float, float, float], label: str = "ours", scene: str = "fox") -> dict[str, Any]:
@@ -73,14 +76,20 @@ def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_referen
     never = [measured(0, (1.0, 33.0, 0.2))]
     elsewhere = result(loop_seconds=None)
     assert table.Run("fox", "ours", [ours], [THEIRS]).matched() == "3.0"
-    assert table.Run("fox", "ours, one of another host", [[*ours, elsewhere]], [THEIRS]).matched() == "3.0"
-    assert table.Run("fox", "of another host", [[elsewhere]], [THEIRS]).matched() == "–"
+    actual = table.Run("fox", "ours, one of another host", [[*ours, elsewhere]], [THEIRS]).matched()
+    assert actual == "3.0"
+    actual = table.Run("fox", "of another host", [[elsewhere]], [THEIRS]).matched()
+    assert actual == "–"
     assert table.Run("fox", "theirs", [THEIRS], [THEIRS]).matched() == "22.0"
     assert table.Run("fox", "never", [never], [THEIRS]).matched() == "never"
     assert table.Run("fox", "alone", [ours]).matched() == "–"
-    assert table.Run("fox", "no curve", [[*ours, result()]], [THEIRS]).matched() == "–"
+    actual = table.Run("fox", "no curve", [[*ours, result()]], [THEIRS]).matched()
+    assert actual == "–"
     assert table.Run("fox", "no reference here", [ours], [[]]).matched() == "–"
-    without_lpips = [{**run, "curve": [{**point, "lpips": None} for point in run["curve"]]} for run in ours]
+    without_lpips = []
+    for run in ours:
+        curve = [{**point, "lpips": None} for point in run["curve"]]
+        without_lpips.append({**run, "curve": curve})
     assert table.Run("fox", "without LPIPS on its way", [without_lpips], [THEIRS]).matched() == "–"
     theirs = [{name: value for name, value in run.items() if name != "lpips"} for run in THEIRS]
     assert table.Run("fox", "to a reference without LPIPS", [without_lpips], [theirs]).matched() == "1.5"
@@ -88,9 +97,12 @@ def test_a_run_matches_when_all_three_measures_first_do_and_a_run_of_the_referen
 
 def test_the_spread_is_the_standard_deviation_pooled_over_folds_and_needs_three_seeds():
     folds = [[result(psnr=p) for p in (30.0, 31.0)], [result(psnr=p) for p in (20.0, 23.0)]]
-    assert table.deviation(folds, "psnr") == pytest.approx(((0.5 + 4.5) / 2) ** 0.5)
-    assert table.deviation([[result(psnr=p) for p in (1.0, 2.0, 3.0)]], "psnr") == pytest.approx(1.0)
-    assert table.deviation(folds[:1], "psnr") is None and table.deviation([[result()], [result()]], "psnr") is None
+    expected = pytest.approx(((0.5 + 4.5) / 2) ** 0.5)
+    assert table.deviation(folds, "psnr") == expected
+    actual = table.deviation([[result(psnr=p) for p in (1.0, 2.0, 3.0)]], "psnr")
+    assert actual == pytest.approx(1.0)
+    assert table.deviation(folds[:1], "psnr") is None
+    assert table.deviation([[result()], [result()]], "psnr") is None
     assert table.Run("castle", "ours", folds).spread("psnr", 2) == "26.00 ± 1.58"
     assert table.Run("castle", "ours", folds[:1]).spread("psnr", 2) == "30.00, 31.00"
     assert table.Run("castle", "ours", folds).seeds() == "2 × 2"
@@ -102,7 +114,8 @@ def test_single_views_of_all_folds_are_in_the_median_and_in_the_worst():
         [result(view_psnr=[25.0]), result(view_psnr=[26.0])],
     ]
     run = table.Run("castle", "ours", folds)
-    assert (run.median_view(), run.worst_view()) == ("25.50", "10.00")
+    assert run.median_view() == "25.50"
+    assert run.worst_view() == "10.00"
     with pytest.raises(ValueError, match="has no view_psnr"):
         table.Run("castle", "ours", [[result()]]).worst_view()
 
@@ -142,16 +155,19 @@ def test_wrong_input_is_one_sentence_and_writes_nothing(
         write_lines(lines, content)
     elif content is not None:
         lines.write_bytes(content if isinstance(content, bytes) else content.encode())
-    assert bench.main(["table", str(lines), "--plots", str(tmp_path / "out"), *options]) == 2
+    status = bench.main(["table", str(lines), "--plots", str(tmp_path / "out"), *options])
+    assert status == 2
     error = capsys.readouterr().err
-    assert re.search(sentence, error) and error.count("\n") == 1
+    assert re.search(sentence, error)
+    assert error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
 def test_labels_are_told_apart_without_colour():
     looks = list(plots.styles(f"label {i}" for i in range(12)).values())
     assert len({look["marker"] for look in looks}) == 12
-    assert all(a["color"] != b["color"] for a, b in itertools.pairwise(looks))
+    for a, b in itertools.pairwise(looks):
+        assert a["color"] != b["color"]
 
 
 def test_a_label_looks_the_same_in_all_panels_and_in_the_legend():
@@ -159,15 +175,15 @@ def test_a_label_looks_the_same_in_all_panels_and_in_the_legend():
     looks = plots.styles(label for _, label in groups)
     figure = plots.quality(groups.items())
     markers = [{str(line.get_marker()) for line in axes.lines} for axes in figure.axes]
-    assert (
-        markers[:3] == [{looks["a"]["marker"], looks["b"]["marker"]}] * 3
-        and markers[3:] == [{looks["b"]["marker"]}] * 3
-    )
+    expected = [{looks["a"]["marker"], looks["b"]["marker"]}] * 3
+    assert markers[:3] == expected
+    assert markers[3:] == [{looks["b"]["marker"]}] * 3
     legend = figure.legends[0]
     shown = [
         (text.get_text(), line.get_marker()) for text, line in zip(legend.get_texts(), legend.get_lines(), strict=True)
     ]
-    assert shown == [("a", looks["a"]["marker"]), ("b", looks["b"]["marker"])]
+    expected = [("a", looks["a"]["marker"]), ("b", looks["b"]["marker"])]
+    assert shown == expected
 
 
 def test_curves_are_means_over_seeds_that_end_with_the_run():
@@ -195,8 +211,11 @@ def test_text_is_readable_and_legends_do_not_reach_beyond_the_figure():
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
     panel = figure.axes[0].get_window_extent()
-    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
-    assert box.y0 >= panel.y1 and panel.height > 1.2 * figure.dpi, "the legend must not eat the panels"
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.width
+    assert box.y1 <= figure.bbox.height
+    assert box.y0 >= panel.y1, "the legend must not eat the panels"
+    assert panel.height > 1.2 * figure.dpi, "the legend must not eat the panels"
     texts: Any = [*figure.legends[0].get_texts(), *figure.axes[0].get_xticklabels(), figure.axes[0].yaxis.label]
     assert min(text.get_fontsize() for text in texts) >= 8
 
@@ -216,9 +235,12 @@ def test_names_of_points_stand_inside_beside_their_points_and_apart():
         boxes = [text.get_window_extent() for text in texts]
         centres = axes.transData.transform([text.xy for text in texts])
         for number, box in enumerate(boxes):
-            assert axes.bbox.containsx(box.x0) and axes.bbox.containsx(box.x1)
-            assert not any(box.contains(*centre) for centre in centres)
-            assert not any(box.overlaps(other) for other in boxes[:number])
+            assert axes.bbox.containsx(box.x0)
+            assert axes.bbox.containsx(box.x1)
+            for centre in centres:
+                assert not box.contains(*centre)
+            for other in boxes[:number]:
+                assert not box.overlaps(other)
             assert np.abs(np.clip(centres[number], box.min, box.max) - centres[number]).max() < 20
     lines = figure.axes[0].lines
     assert [line.get_fillstyle() for line in lines] == ["full", "full", "none", "full"]

@@ -25,17 +25,20 @@ def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_pa
     for split in ("train", "val", "test"):
         read[split] = [path.name for path in parser.get_dataparser_outputs(split).image_filenames]
     assert read["val"] == read["test"] == [names[i] for i in range(4, VIEWS, 8)]
-    assert read["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
+    expected = [name for i, name in enumerate(names) if i % 8 not in (0, 4)]
+    assert read["train"] == expected
 
 
 def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scene: Path, tmp_path: Path):
-    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--folds", "1,4,0", "--noisy", scene.name]) == 0
+    status = bench.main(["validation", str(scene.parent), str(tmp_path), "--folds", "1,4,0", "--noisy", scene.name])
+    assert status == 0
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     for fold in (0, 1, 4):
         for path in (tmp_path / f"{scene.name}-{fold}", tmp_path / f"{scene.name}-{fold}-noisy"):
             lists = {split: (path / f"{split}_list.txt").read_text().split() for split in ("train", "val", "test")}
             assert lists["val"] == lists["test"] == names[fold::8]
-            assert lists["train"] == [name for i, name in enumerate(names) if i % 8 not in (0, fold)]
+            expected = [name for i, name in enumerate(names) if i % 8 not in (0, fold)]
+            assert lists["train"] == expected
 
 
 @pytest.mark.parametrize("folds", ["8", "-1", "2,x", ""])
@@ -48,16 +51,22 @@ def test_a_fold_that_there_is_not_is_refused(folds: str, tmp_path: Path, capsys:
 
 
 def test_noise_turns_training_cameras_about_their_centres_and_leaves_the_others(scene: Path, tmp_path: Path):
-    assert bench.main(["validation", str(scene.parent), str(tmp_path), "--noisy", scene.name]) == 0
+    status = bench.main(["validation", str(scene.parent), str(tmp_path), "--noisy", scene.name])
+    assert status == 0
     outputs = {}
     for name in (scene.name, f"{scene.name}-noisy"):
         parser = ColmapDataParserConfig(data=tmp_path / name, colmap_path=SPARSE, downscale_factor=1)
-        parser.orientation_method, parser.center_method, parser.auto_scale_poses = "none", "none", False
+        parser.orientation_method = "none"
+        parser.center_method = "none"
+        parser.auto_scale_poses = False
         for split in ("train", "test"):
             outputs[name, split] = parser.setup().get_dataparser_outputs(split).cameras.camera_to_worlds
     for split, turned in (("train", True), ("test", False)):
-        true, noisy = outputs[scene.name, split], outputs[f"{scene.name}-noisy", split]
-        np.testing.assert_allclose(noisy[..., 3], true[..., 3], atol=1e-5)
+        true = outputs[scene.name, split]
+        noisy = outputs[f"{scene.name}-noisy", split]
+        actual = noisy[..., 3]
+        expected = true[..., 3]
+        np.testing.assert_allclose(actual, expected, atol=1e-5)
         angles = np.degrees((noisy - true)[:, :, :3].square().sum(dim=(1, 2)).div(2).sqrt().numpy())  # of small turns
         assert 0.05 < np.sqrt((angles**2).mean() / 3) < 0.15 if turned else angles.max() < 1e-3
 
@@ -76,8 +85,10 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
         "train_filenames": names[:20], "val_filenames": names[20:], "test_filenames": names[20:],
     }  # fmt: skip
     (scene / "transforms.json").write_text(json.dumps(content))
-    assert bench.main(["validation", str(scene.parent), str(tmp_path / "out")]) == 0
-    assert bench.main(["validation", str(scene.parent), str(tmp_path / "out"), "--folds", "0,2"]) == 0
+    status = bench.main(["validation", str(scene.parent), str(tmp_path / "out")])
+    assert status == 0
+    status = bench.main(["validation", str(scene.parent), str(tmp_path / "out"), "--folds", "0,2"])
+    assert status == 0
     for copy, held_out in (("listed", names[4:20:8]), ("listed-0", names[20:]), ("listed-2", names[2:20:8])):
         parser = NerfstudioDataParserConfig(data=tmp_path / "out" / copy, downscale_factor=1).setup()
         expected = {"train": [name for name in names[:20] if name not in held_out], "val": held_out, "test": held_out}

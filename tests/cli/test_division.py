@@ -57,7 +57,8 @@ def test_panoramas_are_held_out_whole():
     assert len(divided["train_filenames"]) == len(views) - 9
     later = [name.replace("images/", "images/later/") for name in PANORAMAS]
     grown = divide([*views, *later], True, views, [*divided["test_filenames"], later[0]])
-    assert grown["test_filenames"] == [*divided["test_filenames"], *later[7 * 8 : 8 * 8]]
+    expected = [*divided["test_filenames"], *later[7 * 8 : 8 * 8]]
+    assert grown["test_filenames"] == expected
     few = divide(PANORAMAS[: 4 * 8], measure=True)
     assert few["test_filenames"] == PANORAMAS[: 4 * 8 : 8], "of few panoramas single views are"
     in_folder = [f"images/room.1/{i}.jpg" for i in range(8)]
@@ -86,7 +87,8 @@ def test_options_of_ns_train_that_divide_the_views_do_it(tmp_path: Path):
     write_scene(folder, VIEWS)
     folder.settings.measure = True
     choose_run(folder, ["nerfstudio-data", "--train-split-fraction", "0.5"])
-    assert json.loads((folder.scene / "transforms.json").read_text()).keys() == {"frames"}
+    actual = json.loads((folder.scene / "transforms.json").read_text()).keys()
+    assert actual == {"frames"}
 
 
 def train_command(source: Path, output: Path, measure: bool, options: Sequence[str] = ()) -> list[str]:
@@ -124,7 +126,8 @@ def test_given_cameras_without_lists_are_divided_as_others(given: Path, tmp_path
         parser = OWN[config._target](config)
         images = {split: parser.get_dataparser_outputs(split).image_filenames for split in ("train", "val", "test")}
         every = sorted(images["train"] + images["test"])
-        assert len(every) == count and images["val"] == images["test"] == [every[i] for i in held_out]
+        assert len(every) == count
+        assert images["val"] == images["test"] == [every[i] for i in held_out]
     assert (given / "transforms.json").read_bytes() == content
 
 

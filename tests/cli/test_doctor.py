@@ -99,8 +99,10 @@ def test_it_prints_versions_and_finds_nothing_wrong_with_a_good_scene(tmp_path: 
         f"note: {scene}/sparse/0/points3D.bin has 20 points.",
         f"Next: ns-train sadgs --data {scene}",
     ]
-    assert all(re.fullmatch(r"(note|warning|error): .+\.", line) for line in lines[1:-1])
-    assert result.returncode == int(any(line.startswith("error") for line in lines)), result.stdout + result.stderr
+    for line in lines[1:-1]:
+        assert re.fullmatch(r"(note|warning|error): .+\.", line)
+    expected = int(any(line.startswith("error") for line in lines))
+    assert result.returncode == expected, result.stdout + result.stderr
 
 
 def test_the_command_is_installed_under_its_name():
@@ -149,7 +151,8 @@ def test_a_torchvision_that_was_compiled_for_another_torch_is_an_error(tmp_path:
     spec = SimpleNamespace(origin=str(tmp_path / "__init__.py"))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
     (finding,) = doctor.check_machine()
-    assert (finding.severity, str(tmp_path / "_C.so") in finding.sentence) == ("error", True)
+    assert finding.severity == "error"
+    assert str(tmp_path / "_C.so") in finding.sentence
 
 
 def test_the_file_of_lpips_is_the_one_that_torchvision_downloads():
@@ -161,7 +164,8 @@ def test_the_file_of_lpips_is_the_one_that_torchvision_downloads():
 def test_a_machine_without_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     severity, sentence = about("sees no GPU")
-    assert severity == "warning" and re.search(r"training runs on \d+ CPU cores", sentence)
+    assert severity == "warning"
+    assert re.search(r"training runs on \d+ CPU cores", sentence)
     assert not [s for s in machine() if "its kernels" in s or "CUDA kernels." in s]  # of no use there
 
 
@@ -179,7 +183,8 @@ def test_why_torch_sees_no_gpu_is_told_in_a_sentence(said: str, more: str, monke
 
     monkeypatch.setattr(torch.cuda, "is_available", available)
     severity, sentence = about("sees no GPU")
-    assert severity == "warning" and f" sees no GPU (CUDA initialization: {said}): training runs on" in sentence
+    assert severity == "warning"
+    assert f" sees no GPU (CUDA initialization: {said}): training runs on" in sentence
     assert "a GPU's driver, 580 or newer for CUDA 13 and 525 for CUDA 12, and" in sentence
 
 
@@ -221,7 +226,8 @@ def test_a_gpu_its_driver_and_its_kernels_are_notes(
 def test_a_gpu_that_torch_was_not_built_for_is_an_error(
     capability: tuple[int, int], architectures: list[str], remedy: str | None, cuda: SimpleNamespace
 ):
-    cuda.capability, cuda.architectures = capability, architectures
+    cuda.capability = capability
+    cuda.architectures = architectures
     errors = [sentence for sentence, severity in machine().items() if severity == "error"]
     sm = "sm_{}{}".format(*capability)
     told = f"This torch has code for {', '.join(architectures)}, but none for this GPU, {sm}: install {remedy}"
@@ -232,17 +238,20 @@ def test_a_gpu_that_torch_was_not_built_for_is_an_error(
 def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
     cuda.compiles = cuda.has_gsplat = False
     severity, sentence = about("Triton's")
-    assert severity == "warning" and "(Triton's kernels do not run here: no C compiler): " in sentence
+    assert severity == "warning"
+    assert "(Triton's kernels do not run here: no C compiler): " in sentence
     assert sentence.endswith("install a torch whose Triton is 3.5 or newer, a C compiler and Python's headers.")
     severity, sentence = about("gsplat has")
-    assert severity == "error" and "(neither prebuilt nor compiled): install its wheel" in sentence
+    assert severity == "error"
+    assert "(neither prebuilt nor compiled): install its wheel" in sentence
 
 
 def test_lpips_weights_are_looked_for_where_torch_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     severity, sentence = about("LPIPS with AlexNet")
     (path,) = re.findall(r"downloads them to (\S+\.pth)", sentence)
-    assert severity == "warning" and Path(path).is_relative_to(tmp_path)
+    assert severity == "warning"
+    assert Path(path).is_relative_to(tmp_path)
     Path(path).parent.mkdir(parents=True)
     Path(path).write_bytes(b"weights")
     assert about("LPIPS with AlexNet") == ("note", f"LPIPS with AlexNet has its weights: {path}.")
@@ -340,11 +349,14 @@ def test_the_wheels_node_is_told_with_its_version_or_that_it_does_not_run(
 ):
     put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version="v18.3.0")
     wheels = programs.find_node()
-    assert wheels is not None and programs.is_of_wheel(wheels.node[0])
+    assert wheels is not None
+    assert programs.is_of_wheel(wheels.node[0])
     found = doctor._check_node()
     assert found.severity == "note"
     told = re.fullmatch(r"Node\.js: (\d+)\.\d+\.\d+, (.+), with (.+)\.", found.sentence)
-    assert told is not None and int(told[1]) >= 22 and told.groups()[1:] == wheels.npm
+    assert told is not None
+    assert int(told[1]) >= 22
+    assert told.groups()[1:] == wheels.npm
     monkeypatch.setattr(programs, "find_node", lambda: programs.Node(("/there/node",), ("/there/node", "/there/npm")))
     assert doctor._check_node() == Finding(
         "warning",
@@ -366,4 +378,5 @@ def test_gsplats_kernels_are_not_tried_where_tritons_run(cuda: SimpleNamespace):
     cuda.has_gsplat = False
     findings = machine()
     assert "error" not in findings.values()
-    assert not any("gsplat has" in sentence for sentence in findings)
+    for sentence in findings:
+        assert "gsplat has" not in sentence

@@ -35,7 +35,9 @@ from sadgs_ns.formats import FORMATS, html
 from sadgs_ns.training.run.run_folder import write_config
 from sadgs_ns.training.run.trainer import SadgsTrainer
 
-WIDTH, HEIGHT, VIEWS = 48, 36, 10
+WIDTH = 48
+HEIGHT = 36
+VIEWS = 10
 PARAMS = {
     "means": (3,),
     "scales": (3,),
@@ -121,7 +123,8 @@ def test_rotated_harmonics_in_rotated_directions_give_the_colours_of_before(seed
     after = spherical_harmonics(directions() @ similarity.orthogonal.T, degree) @ rotated
     np.testing.assert_allclose(after, before, atol=1e-12)
     there_and_back = similarity.inverse().harmonics(degree) @ similarity.harmonics(degree)
-    np.testing.assert_allclose(there_and_back, np.eye(len(there_and_back)), atol=1e-12)
+    expected = np.eye(len(there_and_back))
+    np.testing.assert_allclose(there_and_back, expected, atol=1e-12)
 
 
 def test_swapped_axes_swap_harmonics_exactly_to_rounding():
@@ -131,15 +134,19 @@ def test_swapped_axes_swap_harmonics_exactly_to_rounding():
     expected = np.zeros((16, 16))
     for before, after in becomes.items():
         expected[abs(after), before] = -1 if after < 0 else 1
-    np.testing.assert_allclose(Similarity(1.0, SWAP, np.zeros(3)).harmonics(3), expected, atol=2e-15)
+    actual = Similarity(1.0, SWAP, np.zeros(3)).harmonics(3)
+    np.testing.assert_allclose(actual, expected, atol=2e-15)
 
 
 @given(seed=st.integers(0, 2**32 - 1), reflection=st.booleans())
 def test_covariances_turn_with_the_world(seed: int, reflection: bool):
-    scale, orthogonal = 0.3, random_orthogonal(seed, reflection)
+    scale = 0.3
+    orthogonal = random_orthogonal(seed, reflection)
     similarity = Similarity(scale, orthogonal, np.array([1.0, 2, 3]))
     generator = np.random.default_rng(seed)
-    quats, scales, means = generator.normal(size=(5, 4)), generator.normal(size=(5, 3)), generator.normal(size=(5, 3))
+    quats = generator.normal(size=(5, 4))
+    scales = generator.normal(size=(5, 3))
+    means = generator.normal(size=(5, 3))
 
     def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
         covars, _ = _quat_scale_to_covar_preci(torch.tensor(quats), torch.tensor(scales).exp(), True, False)
@@ -152,14 +159,18 @@ def test_covariances_turn_with_the_world(seed: int, reflection: bool):
     broken = np.array([[0.0, 0, 0, 0], [np.nan, 0, 0, 0], [1, np.inf, 0, 0]])
     assert not np.isfinite(similarity.rotations(broken)[1:]).all(axis=1).any()  # the export then drops them
     moved = similarity.positions(means)
-    np.testing.assert_allclose(moved[1] - moved[0], scale * orthogonal @ (means[1] - means[0]), atol=1e-12)
-    np.testing.assert_allclose(similarity.inverse().positions(moved), means, atol=1e-12)
+    actual = moved[1] - moved[0]
+    np.testing.assert_allclose(actual, scale * orthogonal @ (means[1] - means[0]), atol=1e-12)
+    actual = similarity.inverse().positions(moved)
+    np.testing.assert_allclose(actual, means, atol=1e-12)
 
 
 def test_a_float32_rotation_is_made_orthogonal():
     written = random_orthogonal(3, reflection=False).astype(np.float32)
     similarity = Similarity.of(np.c_[0.25 * written, [1, 2, 3]])
-    np.testing.assert_allclose(similarity.orthogonal @ similarity.orthogonal.T, np.eye(3), atol=1e-14)
+    actual = similarity.orthogonal @ similarity.orthogonal.T
+    expected = np.eye(3)
+    np.testing.assert_allclose(actual, expected, atol=1e-14)
     assert similarity.scale == pytest.approx(0.25, abs=1e-7)
 
 
@@ -170,7 +181,8 @@ def test_the_export_in_colmap_s_frame_looks_through_colmap_s_cameras_as_the_mode
     trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     scene, trainer = trained
-    model, dataset = trainer.pipeline.model.eval(), trainer.pipeline.datamanager.train_dataset
+    model = trainer.pipeline.model.eval()
+    dataset = trainer.pipeline.datamanager.train_dataset
     path = tmp_path / "splat.ply"
     export.main([str(trainer.base_dir / "config.yml"), "--output", str(path), "--frame", "colmap"])
     printed = capsys.readouterr().out
@@ -179,7 +191,8 @@ def test_the_export_in_colmap_s_frame_looks_through_colmap_s_cameras_as_the_mode
     means = read(path, "x", "y", "z")
     rest = read(path, *(f"f_rest_{i}" for i in range(45))).reshape(-1, 3, 15).transpose(0, 2, 1)
     harmonics = np.concatenate([read(path, "f_dc_0", "f_dc_1", "f_dc_2")[:, None], rest], 1)
-    quats, scales = read(path, *(f"rot_{i}" for i in range(4))), np.exp(read(path, "scale_0", "scale_1", "scale_2"))
+    quats = read(path, *(f"rot_{i}" for i in range(4)))
+    scales = np.exp(read(path, "scale_0", "scale_1", "scale_2"))
     opacities = torch.sigmoid(torch.from_numpy(read(path, "opacity")[:, 0]))
     scale = trainer.pipeline.datamanager.train_dataparser_outputs.dataparser_scale
     assert scale < 0.5
@@ -225,14 +238,17 @@ def test_nerfstudio_s_frame_keeps_the_parameters_and_colmap_s_returns_to_the_poi
     scene, trainer = trained
     model = trainer.pipeline.model
     assert export.export(Export(trainer.base_dir, tmp_path / "splat.ply")) == model.num_points
-    np.testing.assert_array_equal(read(tmp_path / "splat.ply", "x", "y", "z"), model.means.detach())
-    np.testing.assert_array_equal(read(tmp_path / "splat.ply", "f_rest_17")[:, 0], model.shs_rest.detach()[:, 2, 1])
+    actual = read(tmp_path / "splat.ply", "x", "y", "z")
+    np.testing.assert_array_equal(actual, model.means.detach())
+    actual = read(tmp_path / "splat.ply", "f_rest_17")[:, 0]
+    np.testing.assert_array_equal(actual, model.shs_rest.detach()[:, 2, 1])
     # nerfstudio's own points, moved back, are COLMAP's.
     points = trainer.pipeline.datamanager.train_dataset.metadata["points3D_xyz"].double().numpy()
     back = from_data(trainer.base_dir / "dataparser_transforms.json").inverse().positions(points)
     reconstruction = pycolmap.Reconstruction(scene / SPARSE_FOLDER)
     expected = np.array([point.xyz for _, point in sorted(reconstruction.points3D.items())])
-    np.testing.assert_allclose(np.sort(back, 0), np.sort(expected, 0), atol=1e-5)
+    actual = np.sort(back, 0)
+    np.testing.assert_allclose(actual, np.sort(expected, 0), atol=1e-5)
 
 
 @pytest.mark.hard_case(
@@ -285,7 +301,9 @@ def test_what_is_not_finite_is_dropped_in_every_part_of_the_file(tmp_path: Path,
     assert export.export(Export(run, tmp_path / "splat.ply", "colmap")) == 68_998
     assert "dropped 71002 of 140000 Gaussians that are not finite" in capsys.readouterr().out
     vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
-    assert vertex.count == 68_998 and all(np.isfinite(vertex[p.name]).all() for p in vertex.properties)
+    assert vertex.count == 68_998
+    for p in vertex.properties:
+        assert np.isfinite(vertex[p.name]).all()
     assert len(trimesh.load(tmp_path / "splat.ply").vertices) == 68_998  # type: ignore[union-attr]
 
 
@@ -294,7 +312,8 @@ def test_colours_without_harmonics_become_those_of_degree_0(tmp_path: Path):
     run = write_run(tmp_path / "run", params, np.eye(3, 4))
     export.export(Export(run, tmp_path / "splat.ply", "colmap"))
     shown = 0.5 + 0.28209479 * read(tmp_path / "splat.ply", "f_dc_0", "f_dc_1", "f_dc_2")
-    np.testing.assert_allclose(shown, torch.sigmoid(params["features_dc"]), atol=1e-6)
+    expected = torch.sigmoid(params["features_dc"])
+    np.testing.assert_allclose(shown, expected, atol=1e-6)
     assert "f_rest_0" not in {p.name for p in PlyData.read(str(tmp_path / "splat.ply"))["vertex"].properties}
 
 
@@ -303,14 +322,16 @@ def test_a_reflection_of_the_world_is_undone_as_well(tmp_path: Path):
     mirror = np.diag([1.0, 1, -1])
     run = write_run(tmp_path / "run", params, np.c_[mirror, np.zeros(3)])
     export.export(Export(run, tmp_path / "splat.ply", "colmap"))
-    np.testing.assert_allclose(read(tmp_path / "splat.ply", "x", "y", "z"), params["means"] @ mirror, atol=1e-6)
+    actual = read(tmp_path / "splat.ply", "x", "y", "z")
+    expected = params["means"] @ mirror
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
     # Of degree 1 only z, the second, changes sign.
-    np.testing.assert_allclose(
-        read(tmp_path / "splat.ply", "f_rest_0")[:, 0], params["features_rest"][:, 0, 0], atol=1e-6
-    )
-    np.testing.assert_allclose(
-        read(tmp_path / "splat.ply", "f_rest_1")[:, 0], -params["features_rest"][:, 1, 0], atol=1e-6
-    )
+    actual = read(tmp_path / "splat.ply", "f_rest_0")[:, 0]
+    expected = params["features_rest"][:, 0, 0]
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
+    actual = read(tmp_path / "splat.ply", "f_rest_1")[:, 0]
+    expected = -params["features_rest"][:, 1, 0]
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 # --- the other formats ---
@@ -323,7 +344,8 @@ def test_every_format_is_written_of_a_run(
     """tests/formats reads them back."""
     _, trainer = trained
     path = tmp_path / f"splat{suffix}"
-    assert export.main([str(trainer.base_dir), "--output", str(path), "--frame", "colmap"]) == 0
+    status = export.main([str(trainer.base_dir), "--output", str(path), "--frame", "colmap"])
+    assert status == 0
     assert f"splat{suffix}: {trainer.pipeline.model.num_points:,} Gaussians, " in capsys.readouterr().out
     assert path.stat().st_size > 1000
 
@@ -355,7 +377,8 @@ def test_the_cameras_are_read_as_the_run_read_them(tmp_path: Path):
     write_scene(tmp_path / "other", WIDTH, HEIGHT, VIEWS - 1, points=300)
     (tmp_path / "other/sparse/0").rename(tmp_path / "scene/sparse/0")
     parser = parser_of(tmp_path / "scene")
-    parser.colmap_path, parser.eval_interval = Path("sparse/1"), 3
+    parser.colmap_path = Path("sparse/1")
+    parser.eval_interval = 3
     expected = parser.setup().get_dataparser_outputs("train").cameras
     write_parser_config(tmp_path / "run", parser)
     found = read_cameras(tmp_path / "run")
@@ -398,16 +421,19 @@ def test_the_cameras_of_a_moved_capture_are_the_run_s(options: dict, tmp_path: P
 def test_data_may_be_a_copy_of_another_layout(tmp_path: Path):
     parser = nerfstudio_data(tmp_path / "data")
     parser.data = (tmp_path / "data/transforms.json").rename(tmp_path / "data/other.json")
-    parser.eval_mode, parser.eval_interval = "interval", 3
+    parser.eval_mode = "interval"
+    parser.eval_interval = 3
     write_parser_config(tmp_path / "run", parser)
     expected = parser.setup().get_dataparser_outputs("train").cameras.camera_to_worlds
     np.testing.assert_array_equal(read_cameras(tmp_path / "run").camera_to_worlds, expected)
     with pytest.raises(InputError, match=r"data cannot be read as a capture \(.*: give another with --data\.$"):
         read_cameras(tmp_path / "run", tmp_path / "data")
     parser.data.rename(tmp_path / "data/transforms.json")
-    np.testing.assert_array_equal(read_cameras(tmp_path / "run", tmp_path / "data").camera_to_worlds, expected)
+    actual = read_cameras(tmp_path / "run", tmp_path / "data").camera_to_worlds
+    np.testing.assert_array_equal(actual, expected)
     write_scene(tmp_path / "copy", WIDTH, HEIGHT, VIEWS, points=300)
-    assert len(read_cameras(tmp_path / "run", tmp_path / "copy").sizes) == VIEWS - len(range(0, VIEWS, 8))
+    actual = len(read_cameras(tmp_path / "run", tmp_path / "copy").sizes)
+    assert actual == VIEWS - len(range(0, VIEWS, 8))
 
 
 @pytest.mark.hard_case(
@@ -427,7 +453,8 @@ def test_cameras_are_read_without_their_points(ply: bool, tmp_path: Path, monkey
     monkeypatch.setitem(sys.modules, "open3d", None)  # type: ignore[arg-type]  # Importing it raises ImportError.
     monkeypatch.setattr("rich.prompt.Confirm.ask", None)
     assert len(read_cameras(tmp_path / "run").sizes) > 1
-    assert sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*")) == before
+    actual = sorted((path, path.stat().st_mtime_ns) for path in (tmp_path / "data").rglob("*"))
+    assert actual == before
 
 
 def test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s_name(
@@ -446,7 +473,9 @@ def test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s
     settings = json.loads(re.findall(r">(.*)<", line)[0])["settings"]
     positions = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :, 3].double().numpy()
     x, y, z = positions[html.middle_camera(positions)]
-    np.testing.assert_allclose(settings["cameras"][0]["initial"]["position"], [x, z, -y], atol=1e-5)
+    actual = settings["cameras"][0]["initial"]["position"]
+    expected = [x, z, -y]
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
 def test_the_capture_is_found_without_executing_the_config(tmp_path: Path):
@@ -489,19 +518,24 @@ def test_what_is_taken_away_is_told_and_not_in_the_file(
     trained: tuple[Path, SadgsTrainer], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     _, trainer = trained
-    model, path = trainer.pipeline.model, tmp_path / "splat.ply"
+    model = trainer.pipeline.model
+    path = tmp_path / "splat.ply"
     means = model.means.detach().numpy()
-    low, high = (np.round(np.quantile(means, q, axis=0), 3) for q in (0.1, 0.9))
+    low = np.round(np.quantile(means, 0.1, axis=0), 3)
+    high = np.round(np.quantile(means, 0.9, axis=0), 3)
     extents = model.scales.detach().exp().amax(dim=1).numpy()
     longest = float(np.round(np.quantile(extents, 0.9), 4))
     options = ["--crop", *map(str, low), *map(str, high), "--max-extent", str(longest), "--min-views", "2"]
-    assert export.main([str(trainer.base_dir), "--output", str(path), *options, "--dust", "0.01"]) == 0
+    status = export.main([str(trainer.base_dir), "--output", str(path), *options, "--dust", "0.01"])
+    assert status == 0
     told = [int(line.split()[0].replace(",", "")) for line in capsys.readouterr().out.splitlines()[:4]]
     inside = ((means >= low.astype(np.float32)) & (means <= high.astype(np.float32))).all(axis=1)
-    assert told[0] == (~inside).sum() > 0 and told[1] == (extents[inside] > longest).sum() > 0
+    assert told[0] == (~inside).sum() > 0
+    assert told[1] == (extents[inside] > longest).sum() > 0
     kept = read(path, "x", "y", "z")
     assert len(kept) == model.num_points - sum(told) > 0
-    assert (kept >= low - 1e-6).all() and (kept <= high + 1e-6).all()
+    assert (kept >= low - 1e-6).all()
+    assert (kept <= high + 1e-6).all()
     known = {tuple(row) for row in means[inside & (extents <= longest)]}
     assert {tuple(row) for row in kept} <= known
 
@@ -525,7 +559,8 @@ def test_cleaning_that_cannot_be_meant_is_refused(
     options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     run = write_run(tmp_path / "run", gaussians(3))
-    assert export.main([str(run), "--output", str(tmp_path / "a.ply"), *options.split()]) == 2
+    status = export.main([str(run), "--output", str(tmp_path / "a.ply"), *options.split()])
+    assert status == 2
     assert re.fullmatch(f"sadgs-export: {sentence}\n", capsys.readouterr().err)
     assert not (tmp_path / "a.ply").exists()
 
@@ -549,7 +584,8 @@ def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys
     (run / "nerfstudio_models" / "step-000000011.ckpt").write_bytes(b"half")
     assert export.export(Export(run, tmp_path / "a.ply")) == 3
     printed = " ".join(capsys.readouterr().out.split())
-    assert "step-000000011.ckpt is cut off, damaged" in printed and "step-000000007.ckpt instead" in printed
+    assert "step-000000011.ckpt is cut off, damaged" in printed
+    assert "step-000000007.ckpt instead" in printed
 
 
 @pytest.mark.parametrize(
@@ -596,7 +632,8 @@ def test_errors_are_one_sentence_and_leave_nothing(
         output.mkdir()
     there = set(tmp_path.iterdir())
     run = tmp_path / "nowhere" if case == "no run" else run
-    assert export.main([str(run), "--output", str(output), "--frame", "colmap"]) == 2
+    status = export.main([str(run), "--output", str(output), "--frame", "colmap"])
+    assert status == 2
     printed = capsys.readouterr().err
     assert re.fullmatch(f"sadgs-export: {sentence}\n", printed), printed
     assert set(tmp_path.iterdir()) == there
@@ -611,4 +648,5 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path: Path, capsys: pyte
     partial.symlink_to("/dev/full")
     assert export.main([str(run), "--output", str(output)]) == 2
     assert "a.ply could not be written (No space left on device; " in capsys.readouterr().err
-    assert output.read_text() == "earlier" and not partial.is_symlink()
+    assert output.read_text() == "earlier"
+    assert not partial.is_symlink()

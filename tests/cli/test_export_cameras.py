@@ -41,7 +41,8 @@ def written_poses(file: Path) -> torch.Tensor:
 def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run, trainer = run_of(scene, tmp_path, "refined")
     file = tmp_path / "cameras.json"
-    assert export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)]) == 0
+    status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
+    assert status == 0
     assert f"{file}: {TRAIN_VIEWS} training cameras, refined" in capsys.readouterr().out
     expected = refined_poses(trainer)
     torch.testing.assert_close(written_poses(file), expected, rtol=0, atol=2e-6)
@@ -49,7 +50,8 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     assert float((expected - initial).abs().max()) > 1e-4
     content = json.loads(file.read_text("utf8"))
     files = trainer.pipeline.datamanager.train_dataset.image_filenames
-    assert [frame["file_path"] for frame in content["frames"]] == [str(path) for path in files]
+    actual = [frame["file_path"] for frame in content["frames"]]
+    assert actual == [str(path) for path in files]
 
     arguments = ["--output", str(tmp_path / "splat.ply"), "--cameras", str(file), "--frame", "colmap"]
     assert export.main([str(run), *arguments]) == 0
@@ -61,7 +63,8 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
 def test_training_on_the_written_cameras_begins_where_the_run_ended(scene: Path, tmp_path: Path):
     run, trainer = run_of(scene, tmp_path, "refined")
     file = tmp_path / "again" / "transforms.json"
-    assert export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)]) == 0
+    status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
+    assert status == 0
     parser = NerfstudioDataParserConfig(data=file, eval_mode="all", downscale_factor=1)
     parser._target = OWN.get(parser._target, parser._target)
     outputs = parser.setup().get_dataparser_outputs("train")
@@ -75,7 +78,8 @@ def test_cameras_of_a_run_with_fixed_poses_are_those_of_the_capture(
 ):
     run, trainer = run_of(scene, tmp_path, "fixed")
     file = tmp_path / "cameras.json"
-    assert export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)]) == 0
+    status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
+    assert status == 0
     assert f"{file}: {TRAIN_VIEWS} training cameras, as the capture has them" in capsys.readouterr().out
     initial = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
     torch.testing.assert_close(written_poses(file), initial, rtol=0, atol=2e-6)
@@ -86,14 +90,18 @@ def test_a_capture_of_other_images_and_another_kind_of_file_are_refused(
 ):
     run, trainer = run_of(scene, tmp_path, "fixed")
     splat = tmp_path / "splat.ply"
-    assert export.main([str(run), "--output", str(splat), "--cameras", "cameras.txt"]) == 2
+    status = export.main([str(run), "--output", str(splat), "--cameras", "cameras.txt"])
+    assert status == 2
     assert "--cameras cameras.txt is for a file that ends in .json: name one." in capsys.readouterr().err
     checkpoint = trainer.checkpoint_dir / "step-000000003.ckpt"
     state = torch.load(checkpoint, weights_only=True)
     state["pipeline"]["_extra_state"]["images"] = ["a.png", "b.png"]
     torch.save(state, checkpoint)
     file = tmp_path / "cameras.json"
-    assert export.main([str(run), "--output", str(splat), "--cameras", str(file)]) == 2
+    status = export.main([str(run), "--output", str(splat), "--cameras", str(file)])
+    assert status == 2
     error = capsys.readouterr().err
-    assert f"The capture has {TRAIN_VIEWS} training images" in error and "and the run had 2, a.png, …" in error
-    assert not file.exists() and not splat.exists()
+    assert f"The capture has {TRAIN_VIEWS} training images" in error
+    assert "and the run had 2, a.png, …" in error
+    assert not file.exists()
+    assert not splat.exists()

@@ -28,7 +28,9 @@ from sadgs_ns.formats.gaussians import DEGREE_0
 from sadgs_ns.render.types import RenderOptions
 
 ROOM = room_surfaces()
-WIDTH, HEIGHT, VIEWS = 80, 60, 12
+WIDTH = 80
+HEIGHT = 60
+VIEWS = 12
 SPACING = 0.04
 """Between the centres of Gaussians, in the room's units; their long standard deviations are half of it."""
 MOVED = Similarity(0.4, Rotation.from_euler("xyz", [0.3, -0.5, 1.2]).as_matrix(), np.array([0.1, -0.2, 0.05]))
@@ -96,12 +98,14 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
         assert re.fullmatch(said, capsys.readouterr().out)
     paths = (tmp_path / f"{frame}.mesh.ply" for frame in ("colmap", "nerfstudio"))
     in_room, in_run = (trimesh.load(path, process=False) for path in paths)
-    assert isinstance(in_room, trimesh.Trimesh) and isinstance(in_run, trimesh.Trimesh)
+    assert isinstance(in_room, trimesh.Trimesh)
+    assert isinstance(in_run, trimesh.Trimesh)
     assert len(in_room.vertices) == len(in_run.vertices)
     apart, _ = KDTree(in_run.vertices).query(MOVED.positions(in_room.vertices))  # Threads decide about their order.
     assert apart.max() < 1e-5
     distances, which = nearest(ROOM, in_room.vertices)
-    assert np.median(distances) < 0.5 * voxel and np.quantile(distances, 0.9) < voxel
+    assert np.median(distances) < 0.5 * voxel
+    assert np.quantile(distances, 0.9) < voxel
     middles = in_room.triangles_center
     distances, which = nearest(ROOM, middles)
     for index, axis in ((0, 2), (1, 1), (2, 0)):  # The room's corner is at the origin.
@@ -125,7 +129,8 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
     assert size == pytest.approx(2 * depths / (0.8 * WIDTH), rel=1e-4)
     monkeypatch.setattr(mesh, "MOST_VOXELS", 60 * 16**3)
     larger = meshing.derive_voxel_size(views)
-    assert larger > size and mesh.Fusion(larger).has_room_for(views)
+    assert larger > size
+    assert mesh.Fusion(larger).has_room_for(views)
     assert not mesh.Fusion(larger / 2**0.5).has_room_for(views)
     monkeypatch.setattr(mesh, "MOST_VOXELS", 16**3)
     with pytest.raises(InputError, match=r"^A mesh of voxels of 0\.02 does not fit in memory: .*--voxel-size 0\.04\.$"):
@@ -134,13 +139,15 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
 
 @pytest.mark.usefixtures("open3d")
 def test_what_is_cleaned_away_is_not_in_the_mesh(run: tuple[Path, Path], tmp_path: Path):
-    whole, cut = tmp_path / "whole.mesh.ply", tmp_path / "cut.mesh.ply"
+    whole = tmp_path / "whole.mesh.ply"
+    cut = tmp_path / "cut.mesh.ply"
     assert command(run, whole) == 0
     vertices = trimesh.load(whole, process=False).vertices  # type: ignore[union-attr]
     middle = float(np.median(vertices[:, 0]))
     assert command(run, cut, "--crop", f"{middle}", "-9", "-9", "9", "9", "9") == 0
     left = trimesh.load(cut, process=False).vertices  # type: ignore[union-attr]
-    assert len(left) > 100 and left[:, 0].min() > middle - 3 * SPACING * MOVED.scale
+    assert len(left) > 100
+    assert left[:, 0].min() > middle - 3 * SPACING * MOVED.scale
 
 
 @torch.no_grad()
@@ -158,10 +165,13 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
     K = torch.tensor([[[40.0, 0, 16], [0, 40, 16], [0, 0, 1]]])
     cameras = meshing.RunCameras(pose, K, [(32, 32)])
     (view,) = meshing.render_depths(params, cameras, [0], RenderOptions(max_off_axis=0.0))
-    assert view.depth[16, 16] == pytest.approx(2.0) and view.depth[0, 0] == 0
+    assert view.depth[16, 16] == pytest.approx(2.0)
+    assert view.depth[0, 0] == 0
     alpha = 0.8 * np.exp(-0.5 * ((np.arange(32) + 0.5 - 16) ** 2) / ((0.3 * 20) ** 2 + 0.3))
     assert ((view.depth[16] > 0) == (alpha * np.exp(-0.5 * 0.25 / 36.3) >= 0.5)).all()
-    np.testing.assert_allclose(view.color[16, 16], [0.9, 0.5, 0.1], atol=1e-5)
+    actual = view.color[16, 16]
+    expected = [0.9, 0.5, 0.1]
+    np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 
 @pytest.mark.hard_case(

@@ -39,7 +39,10 @@ from sadgs_ns.training.step.structure_cache import observe_training_views
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.structure_panel import CHOICES, OFF, OUTPUT, StructurePanel, changed, describe, nearest_view
 
-WIDTH, HEIGHT, TRAIN_VIEWS, EVAL_VIEWS = 48, 36, 8, 2
+WIDTH = 48
+HEIGHT = 36
+TRAIN_VIEWS = 8
+EVAL_VIEWS = 2
 ITERATIONS = 60
 """Structure steps come at 10, 20, 30: at the end the run has dropped its statistics."""
 
@@ -84,16 +87,19 @@ def pipeline_of(panel: StructurePanel) -> SadgsPipeline:
 
 
 def test_all_pictures_of_a_finished_run_are_written(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert inspect.main([str(run), "--view", "1", "--output", str(tmp_path / "new")]) == 0
+    status = inspect.main([str(run), "--view", "1", "--output", str(tmp_path / "new")])
+    assert status == 0
     names = [f"train-001-{name}.png" for name in ("ellipses", "wavelength", "eta", "children", "low", "step")]
     assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
     printed = capsys.readouterr().out
-    assert f"after {ITERATIONS} iterations" in printed and f"{TRAIN_VIEWS} training views" in printed
+    assert f"after {ITERATIONS} iterations" in printed
+    assert f"{TRAIN_VIEWS} training views" in printed
     for name in names:
         assert str(tmp_path / "new" / name) in printed
         with Image.open(tmp_path / "new" / name) as image:
             colors = image.convert("RGB").getcolors(1 << 24)
-        assert colors is not None and len(colors) > 30
+        assert colors is not None
+        assert len(colors) > 30
 
 
 @pytest.fixture
@@ -110,7 +116,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_path: Path):
     written = inspection.inspect_run(run.parent, EVAL_VIEWS - 1, "eval", tmp_path, 8, None)
-    assert all(path.name.startswith("eval-001-") and path.is_file() for path in written) and len(written) == 6
+    for path in written:
+        assert path.name.startswith("eval-001-")
+        assert path.is_file()
+    assert len(written) == 6
 
 
 def wrong(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -172,13 +181,15 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     torch.save(state, latest)
     remedy = "give another with --load-step, or another run of sadgs."
     line = wrong([str(tmp_path / "run")], capsys)
-    assert f"{latest} does not fit its run: The checkpoint has no means" in line and line.endswith(remedy)
+    assert f"{latest} does not fit its run: The checkpoint has no means" in line
+    assert line.endswith(remedy)
     state["pipeline"] |= {"_model.gauss_params.means": means}
     extra = state["pipeline"].pop("_extra_state")
     state["pipeline"]["_extra_state"] = {}
     torch.save(state, latest)
     line = wrong([str(tmp_path / "run")], capsys)
-    assert f"{latest} is not of this version of sadgs (" in line and line.endswith(remedy)
+    assert f"{latest} is not of this version of sadgs (" in line
+    assert line.endswith(remedy)
     state["pipeline"]["_extra_state"] = extra
     state["pipeline"] |= {"_model.poses.table": torch.zeros(1, 6)}
     torch.save(state, latest)
@@ -186,10 +197,12 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     config.pipeline.model.poses = "refined"
     (tmp_path / "run" / "config.yml").write_text(yaml.dump(config))
     line = wrong([str(tmp_path / "run")], capsys)
-    assert f"{latest} does not fit its run: The checkpoint's _model.poses.table" in line and line.endswith(remedy)
+    assert f"{latest} does not fit its run: The checkpoint's _model.poses.table" in line
+    assert line.endswith(remedy)
     (folder / "step-000000008.ckpt").write_bytes(b"half")
     line = wrong([str(tmp_path / "run"), "--load-step", "8"], capsys)
-    assert "step-000000008.ckpt is cut off, damaged" in line and line.endswith(remedy)
+    assert "step-000000008.ckpt is cut off, damaged" in line
+    assert line.endswith(remedy)
 
 
 def test_a_gpu_that_is_full_is_one_sentence(
@@ -208,13 +221,15 @@ def test_a_gpu_that_is_full_is_one_sentence(
 def test_observing_all_views_finds_what_training_finds(run: Path):
     """Training's own code, shown every view once and nothing learned in between."""
     pipeline, _ = inspection.load_run(run, load_step=8)
-    observed, model = observe_training_views(pipeline.structure_cache), pipeline.model
+    observed = observe_training_views(pipeline.structure_cache)
+    model = pipeline.model
     model.train()
     model.optimizers = {}
     model.strategy_state = model.strategy.initialize_state()
     model.step = 0
     for index in range(TRAIN_VIEWS):
-        tensors, Ks = pipeline.structure_cache[index][None], pipeline.views.cameras[1][index][None]
+        tensors = pipeline.structure_cache[index][None]
+        Ks = pipeline.views.cameras[1][index][None]
         viewmats = pipeline.views.viewmat(index)[None]
         cameras = Pinholes(viewmats, Ks, WIDTH, HEIGHT)
         _, _, info = model.render(cameras, model.step_options(cameras, [index]))
@@ -230,27 +245,33 @@ def test_observing_all_views_finds_what_training_finds(run: Path):
 
 
 def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
-    before, random = early.state_dict()["_model.gauss_params.means"].clone(), torch.get_rng_state()
+    before = early.state_dict()["_model.gauss_params.means"].clone()
+    random = torch.get_rng_state()
     first = observe_training_views(early.structure_cache)
     torch.testing.assert_close(observe_training_views(early.structure_cache), first)
     inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
-    assert all(parameter.grad is None for parameter in early.model.parameters())
+    for parameter in early.model.parameters():
+        assert parameter.grad is None
 
 
 def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline):
-    model, statistics = early.model, observe_training_views(early.structure_cache)
+    model = early.model
+    statistics = observe_training_views(early.structure_cache)
     children = model.strategy.planned_children(model.gauss_params, statistics).prod(dim=1)
     step = inspection.structure_step(model, statistics)
     assert int(children.max()) > 1
     assert torch.equal(torch.bincount(step["origins"], minlength=model.num_points), children)
     whole = step["origins"][torch.bincount(step["origins"])[step["origins"]] == 1]
-    torch.testing.assert_close(step["means"][: len(whole)], model.means.detach()[whole])
+    actual = step["means"][: len(whole)]
+    expected = model.means.detach()[whole]
+    torch.testing.assert_close(actual, expected)
 
 
 def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
-    model, gradients = early.model, inspection.screen_gradients(early, iter)
+    model = early.model
+    gradients = inspection.screen_gradients(early, iter)
     assert float(gradients["grad_count"].max()) == TRAIN_VIEWS
     assert float(gradients["absgrad2d"].max()) > float(gradients["grad2d"].max()) > 0
     step = inspection.conventional_step(model, gradients)
@@ -272,7 +293,8 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
         x, y = (pixels[:, :2] / pixels[:, 2:]).floor().long().unbind(-1)
         inside = (pixels[:, 2] > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         errors = [(other.photo[y[inside], x[inside]] - colors[inside]).abs().mean() for other in views]
-        assert int(torch.stack(errors).argmin()) == number and int(inside.sum()) > 30
+        assert int(torch.stack(errors).argmin()) == number
+        assert int(inside.sum()) > 30
 
 
 # --- the panel ---
@@ -300,22 +322,22 @@ def test_every_choice_is_a_picture_for_the_viewer_and_nothing_for_evaluation(pan
     camera = a_camera(pipeline)
     camera.rescale_output_resolution(4)
     panel.legend.gui_handle = told = SimpleNamespace(content="")
-    shown, legends = {}, {}
+    shown = {}
+    legends = {}
     for choice in CHOICES:
         panel.choice.value = choice
         panel.choose()
         assert OUTPUT not in pipeline.model.get_outputs_for_camera(camera)
         outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
-        shown[choice], legends[choice] = outputs[OUTPUT], told.content
+        shown[choice] = outputs[OUTPUT]
+        legends[choice] = told.content
         assert outputs[OUTPUT].shape == outputs["rgb"].shape == (4 * HEIGHT, 4 * WIDTH, 3)
         assert 0 <= float(outputs[OUTPUT].min()) < float(outputs[OUTPUT].max()) <= 1
     assert torch.equal(shown[OFF], outputs["rgb"])
-    assert not legends[OFF] and all(
-        "](data:image/png;base64," in legends[choice] for choice in CHOICES if choice != OFF
-    )
-    assert "Gaussians observed)" in legends["η"] and re.search(
-        r"view, `\d+\.png`", legends["ellipses of the nearest photo"]
-    )
+    assert not legends[OFF]
+    assert all("](data:image/png;base64," in legends[choice] for choice in CHOICES if choice != OFF)
+    assert "Gaussians observed)" in legends["η"]
+    assert re.search(r"view, `\d+\.png`", legends["ellipses of the nearest photo"])
     panel.choice.value = OFF
     panel.choose()
     assert told.content == "", "nothing is said of a picture that is not shown"
@@ -332,7 +354,8 @@ def test_drawing_which_the_viewer_may_break_off_loads_no_photo(choice: str, pane
     assert torch.equal(outputs[OUTPUT], outputs["rgb"])
     assert "cached_train" not in vars(pipeline.datamanager)
     panel.choose()
-    assert "cached_train" in vars(pipeline.datamanager) and pipeline.structure_cache.filled
+    assert "cached_train" in vars(pipeline.datamanager)
+    assert pipeline.structure_cache.filled
     outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(a_camera(pipeline)))
     assert not torch.equal(outputs[OUTPUT], outputs["rgb"])
 
@@ -357,7 +380,8 @@ def test_the_pictures_survive_tiny_windows_and_crop_boxes(panel: StructurePanel,
         for box in (None, nowhere, middle):
             outputs = in_the_viewer(lambda box=box: pipeline.model.get_outputs_for_camera(camera, obb_box=box))
             assert outputs[OUTPUT].shape == outputs["rgb"].shape
-    assert rendered and 0 not in rendered, "the kernels cannot render nothing"
+    assert rendered, "the kernels cannot render nothing"
+    assert 0 not in rendered, "the kernels cannot render nothing"
 
 
 @torch.no_grad()
@@ -385,7 +409,8 @@ def test_a_finished_run_is_observed_when_eta_is_asked_for(panel: StructurePanel)
     panel.choice.value = "η"
     panel.choose()
     statistics = panel.statistics()
-    assert statistics is not None and len(statistics["n_total"]) == pipeline_of(panel).model.num_points
+    assert statistics is not None
+    assert len(statistics["n_total"]) == pipeline_of(panel).model.num_points
     with torch.no_grad():  # as a densification does
         for parameter in pipeline_of(panel).model.gauss_params.values():
             parameter.data = parameter.data[:-1]
@@ -399,27 +424,32 @@ def test_where_every_pixel_is_masked_the_panel_says_that_none_was_observed(panel
     panel.choice.value = "η"
     panel.choose()
     statistics = panel.statistics()
-    assert statistics is not None and not (statistics["n_total"] > 0).any()
+    assert statistics is not None
+    assert not (statistics["n_total"] > 0).any()
     picture = panel.picture("η", a_camera(pipeline), torch.zeros(HEIGHT, WIDTH, 3)).picture
     assert (picture == 0).all(), "black"
 
 
 def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     pipeline = pipeline_of(panel)
-    asked, statistics = pipeline.model.plan.strategy, observe_training_views(pipeline.structure_cache)
-    before, split = dataclasses.asdict(asked), []
+    asked = pipeline.model.plan.strategy
+    statistics = observe_training_views(pipeline.structure_cache)
+    before = dataclasses.asdict(asked)
+    split = []
     for tau in (1.0, 0.5, 0.0):
         panel.set_tau_split.value = tau
         panel.set_tau_split.cb_hook(panel.set_tau_split)
         strategy = pipeline.model.plan.strategy
-        assert strategy.tau_split == tau and pipeline.model.strategy == strategy.for_run(pipeline.model.plan.iterations)
+        assert strategy.tau_split == tau
+        assert pipeline.model.strategy == strategy.for_run(pipeline.model.plan.iterations)
         counts = structure_aware(strategy, pipeline.model.gauss_params, statistics).children
         split.append(int((counts > 1).any(dim=1).sum()))
     assert split[0] == 0 < split[1] < split[2]
     panel.set_max_gaussians.value = 777
     panel.set_max_gaussians.cb_hook(panel.set_max_gaussians)
     strategy = pipeline.model.plan.strategy
-    assert strategy.max_gaussians == 777 and type(strategy.max_gaussians) is int
+    assert strategy.max_gaussians == 777
+    assert type(strategy.max_gaussians) is int
     assert "cap 777" in panel.table.text()
     assert pipeline.config.model.strategy.max_gaussians != 777, "what was configured stays"
     assert dataclasses.asdict(asked) == before, "a plan is replaced, not changed"
@@ -433,21 +463,24 @@ def test_sliders_reach_the_strategy_and_the_plan(panel: StructurePanel):
     ],
 )
 def test_values_out_of_range_are_refused_and_put_back(name: str, values: list[Any], panel: StructurePanel):
-    plan, element = pipeline_of(panel).model.plan, getattr(panel, f"set_{name}")
+    plan = pipeline_of(panel).model.plan
+    element = getattr(panel, f"set_{name}")
     before = getattr(plan.strategy, name)
     for value in values:
         with pytest.raises(ValueError, match=name):
             changed(plan, name, value)
         element.value = value
         element.cb_hook(element)
-        assert pipeline_of(panel).model.plan == plan and before == element.value
+        assert pipeline_of(panel).model.plan == plan
+        assert before == element.value
 
 
 def test_counts_of_the_structure_steps_are_kept_in_checkpoints_and_told(run: Path, panel: StructurePanel):
     steps: list[dict[str, int]] = pipeline_of(panel).model.strategy_state["structure_steps"]  # type: ignore[assignment]
     assert [step["iteration"] for step in steps] == [10, 20, 30]
     for step in steps:
-        assert step["split"] <= step["violating"] <= step["before"] and step["low"] <= step["before"]
+        assert step["split"] <= step["violating"] <= step["before"]
+        assert step["low"] <= step["before"]
         assert step["after"] >= step["before"] - step["pruned"] + step["split"]
     assert sum(step["split"] for step in steps) > 0
     for step in steps:

@@ -45,4 +45,5 @@ def test_a_stage_of_several_parts_leaves_a_line_of_each(is_terminal: bool):
 
 
 def test_hours_are_shown_from_one_hour_on():
-    assert [clock(seconds) for seconds in (0.4, 61.6, 3599.6)] == ["0:00", "1:02", "1:00:00"]
+    actual = [clock(seconds) for seconds in (0.4, 61.6, 3599.6)]
+    assert actual == ["0:00", "1:02", "1:00:00"]

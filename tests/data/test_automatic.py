@@ -121,7 +121,9 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     assert config.dataparser == expected(data)
     if isinstance(config.dataparser, ColmapDataParserConfig):
         parsed = config.dataparser.setup().get_dataparser_outputs()
-        assert len(parsed.image_filenames) == 8 and all(path.is_file() for path in parsed.image_filenames)
+        assert len(parsed.image_filenames) == 8
+        for path in parsed.image_filenames:
+            assert path.is_file()
 
 
 @pytest.mark.hard_case(
@@ -138,7 +140,9 @@ def test_the_points_of_a_model_may_be_in_a_ply(scene: Path, tmp_path: Path):
     assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
     config.dataparser._target = ColmapParser
     metadata = config.dataparser.setup().get_dataparser_outputs().metadata
-    assert {*map(tuple, metadata["points3D_rgb"].tolist())} == {*map(tuple, colors.tolist())}
+    actual = {*map(tuple, metadata["points3D_rgb"].tolist())}
+    expected = {*map(tuple, colors.tolist())}
+    assert actual == expected
     assert len(metadata["points3D_xyz"]) == len(positions)
 
 
@@ -148,7 +152,8 @@ def test_the_points_of_a_model_may_be_in_a_ply(scene: Path, tmp_path: Path):
 )
 @pytest.mark.parametrize("layout", [name for name, (_, expected) in LAYOUTS.items() if "images" in name])
 def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path, tmp_path: Path):
-    data, (lay_out, expected) = tmp_path / "capture", LAYOUTS[layout]
+    data = tmp_path / "capture"
+    lay_out, expected = LAYOUTS[layout]
     lay_out(scene, data)
     with pytest.raises(InputError, match=r": add `.*` after `colmap`\.$") as refused:
         check_capture(SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=data)))
@@ -156,7 +161,8 @@ def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path
     config.data = data
     assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
     expected_parser = expected(data)
-    assert isinstance(config.dataparser, ColmapDataParserConfig) and isinstance(expected_parser, ColmapDataParserConfig)
+    assert isinstance(config.dataparser, ColmapDataParserConfig)
+    assert isinstance(expected_parser, ColmapDataParserConfig)
     assert config.dataparser.colmap_path == expected_parser.colmap_path
     assert config.dataparser.images_path == expected_parser.images_path
 
@@ -217,7 +223,9 @@ def test_masks_are_read_by_the_names_in_use(called: str, scene: Path, tmp_path: 
     notes = [finding.sentence for finding in check_capture(config)]
     assert any(f"with {VIEWS} masks" in note for note in notes)
     loaded = config.setup(device="cpu").cached_train
-    assert [int((~view["mask"]).sum()) for view in loaded] == [2, 3, 4, 5, 6, 7, 8, 10]
+    actual = [int((~view["mask"]).sum()) for view in loaded]
+    expected = [2, 3, 4, 5, 6, 7, 8, 10]
+    assert actual == expected
 
 
 @pytest.mark.hard_case(
@@ -275,7 +283,8 @@ def test_the_command_line_tells_a_parser_that_was_named_from_none(scene: Path, c
         config.data = scene
         before = copy.deepcopy(config)
         choose_parser(config)
-        assert config == before and config.dataparser == expected, words
+        assert config == before, words
+        assert config.dataparser == expected, words
         with pytest.raises(
             InputError, match=r"leave `nerfstudio-data` out|add `--colmap-path sparse/0` after `colmap`"
         ):
@@ -292,7 +301,9 @@ def test_a_run_s_config_names_the_parser_and_serves_other_commands_and_more_trai
     assert saved.pipeline.datamanager.dataparser == LAYOUTS["sparse/0"][1](scene)
     trainer = train(config)
     _, pipeline, _, step = eval_setup(path)
-    assert step == 1 and pipeline.datamanager.eval_dataset is not None and len(pipeline.datamanager.eval_dataset) == 2
+    assert step == 1
+    assert pipeline.datamanager.eval_dataset is not None
+    assert len(pipeline.datamanager.eval_dataset) == 2
     again = configure(tmp_path, AutomaticDataParserConfig(), iterations=3)
     again.pipeline.datamanager.data = scene
     again.load_dir = trainer.checkpoint_dir
@@ -319,7 +330,8 @@ def test_large_images_are_taken_as_they_are_and_smaller_copies_where_they_exist(
                 image.resize((image.width // copies, image.height // copies)).save(smaller / path.name)
         config = SadgsDatamanagerConfig(data=large)
         check_capture(config)
-        assert isinstance(config.dataparser, ColmapDataParserConfig) and config.dataparser.downscale_factor == factor
+        assert isinstance(config.dataparser, ColmapDataParserConfig)
+        assert config.dataparser.downscale_factor == factor
         (note,) = [finding.sentence for finding in check_data(large) if " images of " in finding.sentence]
         assert note.endswith("PNG RGB, without masks.") == (factor == 4)
         if factor == 1:
@@ -343,9 +355,11 @@ def test_smaller_copies_are_read_as_they_were_rounded(rounding: str, tmp_path: P
     assert [finding for finding in check_data(tmp_path / "scene") if finding.severity != "note"] == []
     config = SadgsDatamanagerConfig(data=tmp_path / "scene")
     datamanager = config.setup(device="cpu")
-    assert {tuple(data["image"].shape[1::-1]) for data in datamanager.cached_train} == {size}
+    actual = {tuple(data["image"].shape[1::-1]) for data in datamanager.cached_train}
+    assert actual == {size}
     cameras = datamanager.train_dataset.cameras
-    assert {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)} == {size}
+    actual = {(int(w), int(h)) for w, h in zip(cameras.width, cameras.height, strict=True)}
+    assert actual == {size}
 
 
 @pytest.mark.hard_case(
@@ -394,7 +408,9 @@ def test_smaller_copies_without_the_images_are_read_by_the_option_that_is_told(
     config.data = config.dataparser.data = data
     assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
     names = config.dataparser.setup().get_dataparser_outputs().image_filenames
-    assert all(name.is_file() and name.parent.name == "images_4" for name in names)
+    for name in names:
+        assert name.is_file()
+        assert name.parent.name == "images_4"
 
 
 @pytest.mark.hard_case(
@@ -453,7 +469,8 @@ def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: 
     parser.eval_mode = "filename"
     with pytest.raises(InputError, match=r"^images/000\.png has neither train nor eval in its name, by which `--eval-"):
         check_capture(SadgsDatamanagerConfig(dataparser=parser))
-    path, names = tmp_path / "transforms.json", {"000": "eval0", "001": "eval1"}
+    path = tmp_path / "transforms.json"
+    names = {"000": "eval0", "001": "eval1"}
     for image in (tmp_path / "images").iterdir():
         name = names.get(image.stem, f"train{image.stem}")
         image.rename(image.with_stem(name))

@@ -1120,7 +1120,8 @@ def test_unlikely_data_are_told_of_in_one_sentence(case: str, copied: Callable[[
     data = copied("colmap")
     spoil(data)
     (finding,) = remarks(data)
-    assert finding.severity == severity and re.fullmatch(sentence, finding.sentence), finding
+    assert finding.severity == severity, finding
+    assert re.fullmatch(sentence, finding.sentence), finding
 
 
 @pytest.mark.hard_case("an angle of view under 0.5°", "a warning")
@@ -1251,9 +1252,13 @@ def test_a_wild_point_does_not_change_what_training_starts_from(
     for name, value in sound.items():
         assert len(wild[name]) == len(value) - 1
         assert wild[name].isfinite().all()
-    torch.testing.assert_close(wild["means"][3:], sound["means"][4:])
+    actual = wild["means"][3:]
+    expected = sound["means"][4:]
+    torch.testing.assert_close(actual, expected)
     faces = slice(-200, None)
-    torch.testing.assert_close(wild["scales"][faces], sound["scales"][faces])
+    actual = wild["scales"][faces]
+    expected = sound["scales"][faces]
+    torch.testing.assert_close(actual, expected)
 
 
 # --- what looks bad and is not ---
@@ -1375,7 +1380,8 @@ def test_an_images_txt_without_lines_of_keypoints_is_refused(tmp_path: Path):
         with pytest.raises(InputError, match=told):
             colmap.read_poses(path)
     path.write_text("# comments\n" + "\n".join(images) + "1.5 2.5 -1 3.5 4.5 7")
-    assert [name for name, _, _ in colmap.read_poses(path)] == ["000.png", "001.png", "002.png", "003.png"]
+    actual = [name for name, _, _ in colmap.read_poses(path)]
+    assert actual == ["000.png", "001.png", "002.png", "003.png"]
 
 
 @pytest.mark.hard_case(
@@ -1385,7 +1391,8 @@ def test_an_images_txt_without_lines_of_keypoints_is_refused(tmp_path: Path):
 )
 @pytest.mark.parametrize("edit", ["crlf", "tabs", "comments", "blank lines", "no end", "no tracks"])
 def test_texts_of_other_programs_are_read(edit: str, tmp_path: Path):
-    camera, points = "1 SIMPLE_PINHOLE 64 48 50 32 24\n", "1 0 0 1 9 8 7 .5 1 0\n2 0 1 1 9 8 7 .5 1 1\n"
+    camera = "1 SIMPLE_PINHOLE 64 48 50 32 24\n"
+    points = "1 0 0 1 9 8 7 .5 1 0\n2 0 1 1 9 8 7 .5 1 1\n"
     images = "# IMAGE_ID, …\n" + "".join(f"{i} 1 0 0 0 0 0 {i} 1 00{i}.png\n1.5 2.5 -1\n" for i in range(3))
     texts = {"cameras.txt": camera, "images.txt": images, "points3D.txt": points}
     edits: dict[str, Callable[[str], str]] = {
@@ -1398,9 +1405,12 @@ def test_texts_of_other_programs_are_read(edit: str, tmp_path: Path):
     }
     for name, text in texts.items():
         (tmp_path / name).write_bytes(edits[edit](text).encode())
-    assert [name for name, _, _ in colmap.read_poses(tmp_path / "images.txt")] == ["000.png", "001.png", "002.png"]
+    actual = [name for name, _, _ in colmap.read_poses(tmp_path / "images.txt")]
+    assert actual == ["000.png", "001.png", "002.png"]
     assert colmap.read_cameras(tmp_path / "cameras.txt")[1].params == (50, 32, 24)
-    assert colmap.read_points(tmp_path / "points3D.txt")[0].tolist() == [[0, 0, 1], [0, 1, 1]]
+    actual = colmap.read_points(tmp_path / "points3D.txt")[0].tolist()
+    expected = [[0, 0, 1], [0, 1, 1]]
+    assert actual == expected
 
 
 @pytest.mark.hard_case("an images.txt that is not in UTF-8, even on a line of keypoints", "refused, not a traceback")
@@ -1434,15 +1444,20 @@ def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them
     colmap_parsing_utils.write_model(*theirs, str(text), ".txt")
     for folder, ext in ((binary, "bin"), (text, "txt")):
         (camera,) = colmap.read_cameras(folder / f"cameras.{ext}").values()
-        assert (camera.model, camera.width, camera.height) == ("PINHOLE", WIDTH, HEIGHT)
+        assert camera.model == "PINHOLE"
+        assert camera.width == WIDTH
+        assert camera.height == HEIGHT
         assert camera.params == tuple(theirs[0][1].params)
         for (name, camera_id, pose), image in zip(
             colmap.read_poses(folder / f"images.{ext}"), theirs[1].values(), strict=True
         ):
-            assert (name, camera_id) == (image.name, 1)
-            assert pose == pytest.approx(np.concatenate([image.qvec, image.tvec]), abs=1e-12)
+            assert name == image.name
+            assert camera_id == 1
+            expected = pytest.approx(np.concatenate([image.qvec, image.tvec]), abs=1e-12)
+            assert pose == expected
         positions, colors = colmap.read_points(folder / f"points3D.{ext}")
-        assert positions == pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
+        expected = pytest.approx(np.array([point.xyz for point in theirs[2].values()]), abs=1e-12)
+        assert positions == expected
         assert (colors == np.array([point.rgb for point in theirs[2].values()])).all()
 
 
@@ -1512,11 +1527,14 @@ def test_uncaught_errors_print_one_sentence_and_exit_with_1():
             f"import sadgs_ns.training; from sadgs_ns.errors import *; raise {kind.__name__}('Nothing: do something.')"
         )
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANGS)
-        assert (result.returncode, result.stderr) == (1, "error: Nothing: do something.\n")
+        assert result.returncode == 1
+        assert result.stderr == "error: Nothing: do something.\n"
         assert kind.__bases__ == (ordinary,)
     code = "import sadgs_ns.training; raise ValueError('somebody else')"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANGS)
-    assert result.returncode == 1 and result.stderr.startswith("Traceback") and "somebody else" in result.stderr
+    assert result.returncode == 1
+    assert result.stderr.startswith("Traceback")
+    assert "somebody else" in result.stderr
 
 
 @pytest.mark.hard_case(
@@ -1553,7 +1571,8 @@ def test_options_that_cannot_work_are_refused_in_one_sentence_before_anything_is
     setattr(functools.reduce(getattr, owners, config), name, value)
     with pytest.raises(InputError) as refused:
         config.save_config()
-    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(sentence)
+    assert "\n" not in str(refused.value)
     with pytest.raises(InputError, match=re.escape(sentence)):
         set_up(config)
     assert not (tmp_path / "out").exists()
@@ -1574,5 +1593,7 @@ def test_ns_train_on_bad_data_ends_with_the_sentence_alone(
     printed = capsys.readouterr()
     assert "Traceback" not in printed.out + printed.err
     assert printed.err.splitlines()[-1].startswith(f"error: {data / FIRST} has 0 bytes: copy it again, or leave it")
-    assert "Config" not in printed.out and len(printed.out.splitlines()) < 5  # nerfstudio repeats --data
+    assert "Config" not in printed.out
+    # nerfstudio repeats --data.
+    assert len(printed.out.splitlines()) < 5
     assert not (tmp_path / "out").exists()

@@ -34,4 +34,5 @@ def test_a_photo_without_one_of_them_tells_nothing(tmp_path: Path):
         lacking = photo(tmp_path / f"{index}.jpg", {key: value for key, value in TAGS.items() if key != tag})
         zero = photo(tmp_path / f"{index}0.jpg", TAGS | {tag: 0})
         for path in (lacking, zero, tmp_path / "absent.jpg"):
-            assert exposure_stops(path) is None and exposures_of([whole, path]) is None
+            assert exposure_stops(path) is None
+            assert exposures_of([whole, path]) is None

@@ -141,4 +141,5 @@ def test_a_count_beyond_the_file_is_one_sentence_that_names_it(name: str, count:
     at = content.index(b"\0", 8 + 64) + 1 if name == "images.bin" else 8 + 43
     path.write_bytes(content[:at] + struct.pack("<Q", count) + content[at + 8 :])
     message = parse(copy)
-    assert message is not None and message.startswith(f"{path} is cut off or corrupt")
+    assert message is not None
+    assert message.startswith(f"{path} is cut off or corrupt")

@@ -162,12 +162,14 @@ def test_copies_in_other_folders_are_named(layout: str, data: Path, tmp_path: Pa
     if layout == "json":
         put_in_folder(copies, "a", "b")
         (said,) = errors(check_nerfstudio(data, ParserOptions(downscale_factor=4)))
-        missing, there = "000.png", "a/000.png"
+        missing = "000.png"
+        there = "a/000.png"
     else:
         put_in_folder(data / "images", "camera")
         name_images(data, lambda name: f"camera/{name}")
         (said,) = errors(check_colmap(data, ParserOptions(colmap_path=SPARSE_FOLDER, downscale_factor=4)))
-        missing, there = "camera/000.png", "000.png"
+        missing = "camera/000.png"
+        there = "000.png"
     assert re.match(rf"{copies / missing}.* does not exist, but {copies / there} does: ", said)
 
 

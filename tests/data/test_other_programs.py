@@ -84,7 +84,8 @@ def expect_the_same_cameras(data: Path, original: Path) -> None:
     """What is read is what the original means, and nothing in the folder has changed."""
     files = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
     assert errors(data) == []
-    found, expected = (read_cameras(data / "no run", folder) for folder in (data, original))
+    found = read_cameras(data / "no run", data)
+    expected = read_cameras(data / "no run", original)
     torch.testing.assert_close(found.camera_to_worlds, expected.camera_to_worlds)
     torch.testing.assert_close(found.Ks, expected.Ks, rtol=1e-5, atol=1e-4)
     assert found.sizes == expected.sizes
@@ -129,13 +130,19 @@ def test_a_transforms_json_is_read_as_its_program_means_it(
 @pytest.mark.hard_case("lenses and camera models in frames; `is_fisheye`", "read; mixed ones are refused")
 def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
     data = write(lambda m: m.update(k1=0.5, p1=0.1), lambda f: f.update(k1=0.01, k2=0.02))
-    torch.testing.assert_close(parsed(data).distortion_params, torch.tensor([0.01, 0.02, 0, 0, 0, 0]).expand(9, 6))
+    actual = parsed(data).distortion_params
+    expected = torch.tensor([0.01, 0.02, 0, 0, 0, 0]).expand(9, 6)
+    torch.testing.assert_close(actual, expected)
     shutil.rmtree(data)
     data = write(lambda m: m.update(is_fisheye=True, k1=0.01))
-    assert errors(data) == [] and set(parsed(data).camera_type.flatten().tolist()) == {CameraType.FISHEYE.value}
+    assert errors(data) == []
+    actual = set(parsed(data).camera_type.flatten().tolist())
+    assert actual == {CameraType.FISHEYE.value}
     shutil.rmtree(data)
     data = write(lambda m: m.pop("camera_model"), lambda f: f.update(camera_model="OPENCV_FISHEYE", k1=0.01))
-    assert errors(data) == [] and set(parsed(data).camera_type.flatten().tolist()) == {CameraType.FISHEYE.value}
+    assert errors(data) == []
+    actual = set(parsed(data).camera_type.flatten().tolist())
+    assert actual == {CameraType.FISHEYE.value}
     shutil.rmtree(data)
     (said,) = errors(write(lambda m: m["frames"][3].update(camera_model="OPENCV_FISHEYE")))
     assert said.endswith("mixes the camera models OPENCV and OPENCV_FISHEYE: keep the frames of one of them.")
@@ -224,8 +231,10 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
     (data / "transforms_train.json").rename(data / "transforms.json")
     assert errors(data) == []
     cameras = parsed(data)
-    torch.testing.assert_close(cameras.fx, torch.full_like(cameras.fx, FOCAL))
-    assert set(cameras.cx.flatten().tolist()) == {20.0} and (cameras.distortion_params[:, 0] > 0).all()
+    expected = torch.full_like(cameras.fx, FOCAL)
+    torch.testing.assert_close(cameras.fx, expected)
+    assert set(cameras.cx.flatten().tolist()) == {20.0}
+    assert (cameras.distortion_params[:, 0] > 0).all()
 
 
 @pytest.mark.hard_case(
@@ -307,15 +316,18 @@ def test_the_command_that_keeps_an_export_s_poses_is_named(
     Image.new("RGB", (8, 8)).save(data / photos / "1.jpg")
     (said,) = errors(data)
     named = re.search("`ns-process-data ([^`]*)`", said)
-    assert said.startswith(f"{data / file} has poses: `ns-process-data ") and named
+    assert said.startswith(f"{data / file} has poses: `ns-process-data ")
+    assert named
     words = shlex.split(named[1].replace("FOLDER", str(tmp_path / "out")))
     commands: Any = process_data.Commands
     command = tyro.cli(commands, args=words)
-    assert type(command).__name__ == kind and command.output_dir == tmp_path / "out"
+    assert type(command).__name__ == kind
+    assert command.output_dir == tmp_path / "out"
     assert command.data == (data / photos if options else data)
     for name, value in options.items():
         assert getattr(command, name).name == value
-    assert poses_elsewhere(data) == said and poses_elsewhere(tmp_path / "out") is None
+    assert poses_elsewhere(data) == said
+    assert poses_elsewhere(tmp_path / "out") is None
 
 
 @pytest.mark.hard_case(

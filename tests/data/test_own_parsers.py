@@ -32,11 +32,13 @@ OF_CAMERAS = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height", "di
 def expect_the_same(found: DataparserOutputs, expected: DataparserOutputs) -> None:
     """All that a parser makes is the same, to the bit."""
     for name in OF_CAMERAS:
-        mine, theirs = getattr(found.cameras, name), getattr(expected.cameras, name)
+        mine = getattr(found.cameras, name)
+        theirs = getattr(expected.cameras, name)
         if theirs is None:
             assert mine is None
         else:
-            assert mine.dtype == theirs.dtype and torch.equal(mine, theirs), name
+            assert mine.dtype == theirs.dtype, name
+            assert torch.equal(mine, theirs), name
     assert found.cameras.metadata == expected.cameras.metadata
     assert found.image_filenames == expected.image_filenames
     assert found.mask_filenames == expected.mask_filenames
@@ -47,7 +49,8 @@ def expect_the_same(found: DataparserOutputs, expected: DataparserOutputs) -> No
     if expected.alpha_color is None:
         assert found.alpha_color is None
     else:
-        assert found.alpha_color is not None and torch.equal(found.alpha_color, expected.alpha_color)
+        assert found.alpha_color is not None
+        assert torch.equal(found.alpha_color, expected.alpha_color)
 
 
 def lists(meta: dict[str, Any]) -> None:
@@ -109,7 +112,8 @@ def test_a_transforms_json_becomes_what_nerfstudio_makes_of_it(
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
     for data in (tmp_path, tmp_path / "transforms.json"):
         config = NerfstudioDataParserConfig(data=data, **options)
-        found, expected = (parser(config).get_dataparser_outputs(split) for parser in (TransformsParser, Nerfstudio))
+        found = TransformsParser(config).get_dataparser_outputs(split)
+        expected = Nerfstudio(config).get_dataparser_outputs(split)
         expect_the_same(found, expected)
 
 
@@ -118,7 +122,8 @@ def test_a_transforms_json_becomes_what_nerfstudio_makes_of_it(
 def test_a_blender_scene_becomes_what_nerfstudio_makes_of_it(options: dict[str, Any], split: str, tmp_path: Path):
     blender_data(tmp_path, "white")
     config = BlenderDataParserConfig(data=tmp_path, **options)
-    found, expected = (parser(config).get_dataparser_outputs(split) for parser in (BlenderParser, Blender))
+    found = BlenderParser(config).get_dataparser_outputs(split)
+    expected = Blender(config).get_dataparser_outputs(split)
     expect_the_same(found, expected)
 
 

@@ -42,8 +42,10 @@ def test_a_folder_that_a_parser_cannot_read_is_refused_before_a_run_begins(name:
     with pytest.raises(InputError) as refused:
         config.save_config()
     sentence = str(refused.value)
-    assert sentence.startswith(f"{tmp_path}/data cannot be read by {name} (") and "give --data the folder" in sentence
-    assert "\n" not in sentence and not (tmp_path / "out").exists()
+    assert sentence.startswith(f"{tmp_path}/data cannot be read by {name} (")
+    assert "give --data the folder" in sentence
+    assert "\n" not in sentence
+    assert not (tmp_path / "out").exists()
 
 
 def moving_scene(folder: Path, times: list[float]) -> None:
@@ -88,4 +90,5 @@ def test_names_of_files_may_be_texts(tmp_path: Path):
     assert is_finite(trainer.pipeline.model)
     outputs = trainer.pipeline.datamanager.train_dataset._dataparser_outputs
     assert outputs.mask_filenames is not None
-    assert all(isinstance(path, Path) for path in (*outputs.image_filenames, *outputs.mask_filenames))
+    for path in (*outputs.image_filenames, *outputs.mask_filenames):
+        assert isinstance(path, Path)

@@ -111,7 +111,8 @@ def test_points_that_do_not_fit_the_photos_are_warned_of(
     path = data / (SPARSE_FOLDER / "points3D.bin" if layout == "colmap" else "points.ply")
     leave_out = "--load-3D-points False`" if layout == "colmap" else f"remove ply_file_path from {data}/transforms.json"
     start = f"{path} has points whose colours are not those of the photos where the poses put them, as where "
-    assert told.startswith(start) and told.endswith(f"{leave_out} to start from random points.")
+    assert told.startswith(start)
+    assert told.endswith(f"{leave_out} to start from random points.")
 
 
 @pytest.mark.parametrize(

@@ -10,4 +10,5 @@ from sadgs_ns.data.colmap_views import _rotations
 
 def test_quaternions_become_the_matrices_that_scipy_makes_of_them():
     quats = np.random.default_rng(0).normal(size=(50, 4))  # wxyz, not of unit length
-    np.testing.assert_allclose(_rotations(quats), Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix(), atol=1e-12)
+    expected = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(_rotations(quats), expected, atol=1e-12)

@@ -70,7 +70,8 @@ def test_resuming_from_a_hostile_checkpoint_executes_nothing(
 ):
     if forced:  # what people set for other methods' checkpoints
         monkeypatch.setenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", "1")
-    checkpoint, executed = tmp_path / "step-000000003.ckpt", tmp_path / "executed"
+    checkpoint = tmp_path / "step-000000003.ckpt"
+    executed = tmp_path / "executed"
     torch.save({"step": 3, "pipeline": Payload(executed), "optimizers": {}, "scalers": {}}, checkpoint)
     folder = tmp_path / "checkpoints"
     folder.mkdir()
@@ -90,7 +91,8 @@ def test_resuming_from_a_hostile_checkpoint_executes_nothing(
     "torch ≥ 2.6 refuses it; nothing is executed",
 )
 def test_evaluating_a_hostile_checkpoint_executes_nothing(config: SadgsTrainerConfig, tmp_path: Path):
-    executed, config.load_dir = tmp_path / "executed", tmp_path / "checkpoints"
+    executed = tmp_path / "executed"
+    config.load_dir = tmp_path / "checkpoints"
     config.load_dir.mkdir()
     torch.save({"step": 3, "pipeline": Payload(executed)}, config.load_dir / "step-000000003.ckpt")
     with pytest.raises(Exception, match="Weights only load failed"):
@@ -103,7 +105,8 @@ def test_evaluating_a_hostile_checkpoint_executes_nothing(config: SadgsTrainerCo
     "**it is executed**, by nerfstudio, before any code of ours; the README warns",
 )
 def test_nerfstudio_executes_what_a_config_yml_says_as_the_readme_warns(tmp_path: Path):
-    executed, path = tmp_path / "executed", tmp_path / "config.yml"
+    executed = tmp_path / "executed"
+    path = tmp_path / "config.yml"
     path.write_text(yaml_payload(executed))
     with pytest.raises(AssertionError):  # it is no config, but that comes too late
         eval_setup(path)
@@ -170,7 +173,9 @@ def test_image_names_that_leave_their_folder_or_reach_a_shell_are_refused(
     parser = rename_first_image(scene, tmp_path / "copy", name, text)
     with pytest.raises(ValueError) as error:
         SadgsDatamanagerConfig(dataparser=parser).setup(device="cpu")
-    assert "images." in str(error.value) and repr(name) in str(error.value) and "\n" not in str(error.value)
+    assert "images." in str(error.value)
+    assert repr(name) in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def transforms(folder: Path, names: list[str]) -> NerfstudioDataParserConfig:
@@ -271,7 +276,8 @@ def test_the_help_shows_that_the_viewer_listens_on_loopback(method: str, capsys:
     with pytest.raises(SystemExit):
         cli(AnnotatedBaseConfigUnion, args=[method, "--help"])
     _, found, after = capsys.readouterr().out.partition("--viewer.websocket-host")
-    assert found and "(default: 127.0.0.1)" in " ".join(after.split())[:200]
+    assert found
+    assert "(default: 127.0.0.1)" in " ".join(after.split())[:200]
 
 
 @pytest.mark.hard_case(

@@ -81,7 +81,8 @@ def test_nothing_is_hidden_in_images_without_mask(layout: str, scene: Path, tmp_
     assert hidden == [0, 0, 12, 12, *[0] * (VIEWS - 4)]
     for index, number in enumerate(hidden):  # As `ns-render dataset` reads them
         mask = manager.train_dataset.get_data(index)["mask"]
-        assert mask.shape[:2] == manager.train_dataset.get_data(index)["image"].shape[:2]
+        expected = manager.train_dataset.get_data(index)["image"].shape[:2]
+        assert mask.shape[:2] == expected
         assert int((~mask.bool()).sum()) == number
 
 

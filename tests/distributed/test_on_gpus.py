@@ -36,7 +36,8 @@ def run(command: list[str]) -> subprocess.CompletedProcess[str]:
 def compare_with_one(world: World, views: int) -> None:
     """Compare this process's part of images, gradients and absolute gradients with those of one process."""
     device = world.device
-    weight, options = weights(views).to(device), RenderOptions(sh_degree=1, absgrad=True)
+    weight = weights(views).to(device)
+    options = RenderOptions(sh_degree=1, absgrad=True)
     alone = {name: value.detach().to(device).requires_grad_() for name, value in inputs().items()}
     colors, alphas, info = rasterize_alone(*splats(alone, views), options)
     expected = torch.cat([colors, alphas], dim=-1)
@@ -59,7 +60,8 @@ def compare_with_one(world: World, views: int) -> None:
     for name in ("grad2d", "absgrad"):
         whole = getattr(info["means2d"], name)[:, part]
         scale = float(whole[seen].abs().max())
-        torch.testing.assert_close(getattr(own["means2d"], name)[seen], whole[seen], atol=1e-3 * scale, rtol=1e-2)
+        actual = getattr(own["means2d"], name)[seen]
+        torch.testing.assert_close(actual, whole[seen], atol=1e-3 * scale, rtol=1e-2)
     for name, leaf in mine.items():
         gradient = alone[name].grad
         assert gradient is not None
@@ -79,7 +81,8 @@ def assert_finished(result: subprocess.CompletedProcess[str], folder: Path) -> N
     (checkpoint,) = folder.rglob("*.ckpt")
     state = torch.load(checkpoint, weights_only=True)
     number = len(state["pipeline"]["_model.gauss_params.means"])
-    assert number > 100 and len(state["optimizers"]["means"]["state"][0]["exp_avg"]) == number
+    assert number > 100
+    assert len(state["optimizers"]["means"]["state"][0]["exp_avg"]) == number
     assert len(re.findall("Training Finished", result.stdout)) == 1
 
 

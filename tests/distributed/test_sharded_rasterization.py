@@ -83,7 +83,8 @@ def test_processes_draw_and_differentiate_what_one_does(
             torch.testing.assert_close(image, expected[band.view, band.first : band.last], atol=1e-5, rtol=0)
         assert result["flags"] == (1 << ranks) - 1
     assert (covered == 1).all()
-    torch.testing.assert_close(sum(result["loss"] for result in results), loss.detach(), rtol=1e-5, atol=0)
+    actual = sum(result["loss"] for result in results)
+    torch.testing.assert_close(actual, loss.detach(), rtol=1e-5, atol=0)
 
     def together(name: str, dim: int) -> Tensor:
         return torch.cat([result[name] for result in results], dim=dim)
@@ -93,7 +94,8 @@ def test_processes_draw_and_differentiate_what_one_does(
     assert info["means2d"].grad is not None
     for name, tensor in (("grad2d", info["means2d"].grad), ("absgrad", info["means2d"].absgrad)):
         scale = float(tensor[seen].abs().max())
-        torch.testing.assert_close(together(name, 1)[seen], tensor[seen], atol=1e-5 * scale, rtol=1e-4)
+        actual = together(name, 1)[seen]
+        torch.testing.assert_close(actual, tensor[seen], atol=1e-5 * scale, rtol=1e-4)
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         gradient = torch.cat([result["gradients"][name] for result in results])
@@ -103,17 +105,24 @@ def test_processes_draw_and_differentiate_what_one_does(
 @pytest.mark.parametrize(("views", "height", "ranks"), [(4, 100, 2), (1, 33, 3), (3, 75, 2), (2, 10, 3), (5, 64, 3)])
 def test_bands_cover_every_row_once_and_evenly(views: int, height: int, ranks: int):
     bands = share_rows(views, height, ranks)
-    assert [(b.view, b.first) for b in bands] == sorted((b.view, b.first) for b in bands)
+    actual = [(b.view, b.first) for b in bands]
+    expected = sorted((b.view, b.first) for b in bands)
+    assert actual == expected
     assert [b.rank for b in bands] == sorted(b.rank for b in bands)
     rows = [(b.view, row) for b in bands for row in range(b.first, b.last)]
     assert rows == [(view, row) for view in range(views) for row in range(height)]
     if views % ranks == 0:
-        assert all((b.first, b.last, b.top, b.bottom) == (0, height, 0, height) for b in bands)
-    shares = [sum(b.last - b.first for b in bands if b.rank == rank) for rank in range(ranks)]
+        for b in bands:
+            assert (b.first, b.last, b.top, b.bottom) == (0, height, 0, height)
+    shares = [0] * ranks
+    for band in bands:
+        shares[band.rank] += band.last - band.first
     assert max(shares) - min(shares) <= max(2 * ROWS, height if height < ROWS else 0)
 
 
 def test_views_of_several_sizes_are_shared_out_size_by_size():
     sizes = (48, 64), (30, 40), (48, 64), (48, 64), (30, 40)
-    assert [views_of_rank(sizes, 3, rank) for rank in range(3)] == [(0,), (2, 1), (3, 4)]
+    actual = [views_of_rank(sizes, 3, rank) for rank in range(3)]
+    expected = [(0,), (2, 1), (3, 4)]
+    assert actual == expected
     assert [views_of_rank(sizes[:2], 2, rank) for rank in range(2)] == [(0,), (0, 1)]  # 30 rows are not cut.

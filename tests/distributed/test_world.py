@@ -24,7 +24,8 @@ def growths() -> list[tuple[torch.Tensor, torch.Tensor]]:
     growth = torch.randint(0, 9, (90,), generator=generator)
     ties = torch.randint(0, 6, (90,), generator=generator).float()
     spread = torch.exp(20 * torch.randn(90, generator=generator))
-    spread[7], spread[50] = float("inf"), 0.0
+    spread[7] = float("inf")
+    spread[50] = 0.0
     outgrown = growth.clone()
     outgrown[spread.argmax()] = 511
     return [(growth, ties), (growth, spread), (outgrown, spread), (torch.ones_like(growth), ties), (0 * growth, ties)]
@@ -44,12 +45,21 @@ def test_the_budget_goes_to_the_same_gaussians(tmp_path: Path):
 
 
 def test_a_world_of_one_process_asks_nobody():
-    world, values = World(), torch.tensor([3, 4])
-    assert world.is_single and world.rank == 0 and world.take_even_part(5) == slice(0, 5) and world.total == 5
-    assert world.sum(values) is values and world.sums(3, 4) == [3, 4]
-    assert world.gather(values).tolist() == [[3, 4]] and values.data_ptr() == world.gather(values).data_ptr()
+    world = World()
+    values = torch.tensor([3, 4])
+    assert world.is_single
+    assert world.rank == 0
+    assert world.take_even_part(5) == slice(0, 5)
+    assert world.total == 5
+    assert world.sum(values) is values
+    assert world.sums(3, 4) == [3, 4]
+    assert world.gather(values).tolist() == [[3, 4]]
+    assert values.data_ptr() == world.gather(values).data_ptr()
     world.broadcast(values, 0)
-    assert values.tolist() == [3, 4] and world.least(2.5) == 2.5 and world.all(True) and not world.all(False)
+    assert values.tolist() == [3, 4]
+    assert world.least(2.5) == 2.5
+    assert world.all(True)
+    assert not world.all(False)
     torch.manual_seed(4)
     drawn = world.rand(torch.empty((2, 22, 2)))
     torch.manual_seed(4)
@@ -62,7 +72,9 @@ def exchange_rows(world: World) -> dict[str, Any]:
     start = sum(sizes[: world.rank])
     mine = rows[start : start + sizes[world.rank]]
     world.count(len(mine))
-    uneven, gathered, evened = world.is_uneven(), world.gather_rows(mine), world.rebalance(mine)
+    uneven = world.is_uneven()
+    gathered = world.gather_rows(mine)
+    evened = world.rebalance(mine)
     world.rebalance(mine[:, :0])  # Coefficients of harmonics have no numbers where the degree is 0.
     world.count(len(evened))
     torch.manual_seed(4)
@@ -85,8 +97,10 @@ def test_rows_are_gathered_and_evened_out_in_the_order_of_the_ranks(tmp_path: Pa
     after = torch.rand(1)
     for result in results:
         assert result["sizes"] == [7, 7, 8]
-        assert result["uneven"] and not result["even"]  # 8 is more than 1.1 times 7.
-        assert torch.equal(result["after"], after) and result["least"] == 1.0
+        assert result["uneven"]  # 8 is more than 1.1 times 7.
+        assert not result["even"]
+        assert torch.equal(result["after"], after)
+        assert result["least"] == 1.0
         assert result["all"] == (True, False)
 
 
@@ -111,7 +125,8 @@ def prune_together(world: World) -> list[int]:
 )
 def test_each_process_keeps_a_gaussian(tmp_path: Path):
     """Two processes cannot train the one Gaussian that the first pruning would leave them."""
-    assert run_ranks(prune_together, 2, tmp_path) == [[4, 0, 1], [4, 3, 2]]
+    expected = [[4, 0, 1], [4, 3, 2]]
+    assert run_ranks(prune_together, 2, tmp_path) == expected
 
 
 def share_out_too_few(world: World) -> str:

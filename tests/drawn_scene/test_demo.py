@@ -30,7 +30,9 @@ from examples.drawn_scene.scene import (
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.files import atomic_path
 
-WIDTH, HEIGHT, VIEWS = 48, 36, 9
+WIDTH = 48
+HEIGHT = 36
+VIEWS = 9
 
 
 @contextmanager
@@ -49,7 +51,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SceneDescri
 
 def wall(distance: float = 2.0, wavelength: float = 0.2, angle: float = 0.0, **changes) -> Rectangle:
     """A large wall at z = distance, seen by `camera`."""
-    corner, u, v = np.array([-20.0, -20.0, distance]), np.array([40.0, 0, 0]), np.array([0, 40.0, 0])
+    corner = np.array([-20.0, -20.0, distance])
+    u = np.array([40.0, 0, 0])
+    v = np.array([0, 40.0, 0])
     plain = Rectangle("wall", corner, u, v, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "grating", wavelength, angle)
     return dataclasses.replace(plain, **changes)
 
@@ -63,20 +67,27 @@ def test_scene_is_deterministic(written: tuple[Path, SceneDescription], tmp_path
     again = tmp_path / "again"
     write_scene(again, WIDTH, HEIGHT, VIEWS, points=200)
     files = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
-    assert files == sorted(str(path.relative_to(again)) for path in again.rglob("*") if path.is_file())
-    assert filecmp.cmpfiles(folder, again, files, shallow=False) == (files, [], [])
+    expected = sorted(str(path.relative_to(again)) for path in again.rglob("*") if path.is_file())
+    assert files == expected
+    actual = filecmp.cmpfiles(folder, again, files, shallow=False)
+    assert actual == (files, [], [])
 
 
 def test_seed_moves_only_the_points() -> None:
-    first, second = (describe_scene(WIDTH, HEIGHT, VIEWS, 50, seed) for seed in (0, 1))
+    first = describe_scene(WIDTH, HEIGHT, VIEWS, 50, 0)
+    second = describe_scene(WIDTH, HEIGHT, VIEWS, 50, 1)
     assert not np.array_equal(first.points, second.points)
     assert first.wavelengths == second.wavelengths
-    np.testing.assert_array_equal(first.views[3].rotation, second.views[3].rotation)
+    actual = first.views[3].rotation
+    expected = second.views[3].rotation
+    np.testing.assert_array_equal(actual, expected)
 
 
 def test_poses_are_rotations() -> None:
     for view in arc_views(VIEWS, WIDTH, HEIGHT):
-        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+        actual = view.rotation @ view.rotation.T
+        expected = np.eye(3)
+        np.testing.assert_allclose(actual, expected, atol=1e-12)
         assert np.linalg.det(view.rotation) == pytest.approx(1)
         assert view.rotation[1, 2] < 0  # the image's down is the world's down
 
@@ -85,7 +96,8 @@ def test_rays_and_projection_agree() -> None:
     view = arc_views(3, WIDTH, HEIGHT)[2]
     pixels, depth = view.project(view.position + 1.7 * view.rays())
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    np.testing.assert_allclose(pixels, np.stack([columns.ravel(), rows.ravel()], -1), atol=1e-9)
+    expected = np.stack([columns.ravel(), rows.ravel()], -1)
+    np.testing.assert_allclose(pixels, expected, atol=1e-9)
     np.testing.assert_allclose(depth, 1.7)
 
 
@@ -126,7 +138,8 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     parser = ColmapDataParserConfig(
         data=folder, colmap_path=SPARSE_FOLDER, downscale_factor=1, eval_mode="interval", eval_interval=EVAL_INTERVAL
     ).setup()
-    train, held_out = parser.get_dataparser_outputs("train"), parser.get_dataparser_outputs("val")
+    train = parser.get_dataparser_outputs("train")
+    held_out = parser.get_dataparser_outputs("val")
     assert [path.name for path in held_out.image_filenames] == ["000.png", "008.png"]
     assert len(train.image_filenames) == VIEWS - 2
     with Image.open(train.image_filenames[0]) as image:
@@ -134,22 +147,26 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     assert train.metadata["points3D_xyz"].shape == (200, 3)
     assert (train.metadata["points3D_num_points2D"] >= 2).all()
     # What nerfstudio made of poses and points still projects to the same pixels.
-    pose, view = train.cameras.camera_to_worlds[0], scene.views[1]
+    pose = train.cameras.camera_to_worlds[0]
+    view = scene.views[1]
     points = train.metadata["points3D_xyz"]
     local = (points - pose[:, 3]) @ pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])  # OpenGL → OpenCV
     pixels = view.focal * local[:, :2] / local[:, 2:] + torch.tensor([WIDTH / 2, HEIGHT / 2])
-    np.testing.assert_allclose(pixels.numpy(), view.project(scene.points)[0], atol=1e-2)
+    expected = view.project(scene.points)[0]
+    np.testing.assert_allclose(pixels.numpy(), expected, atol=1e-2)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_wavelength_of_a_fronto_parallel_wall(angle: float) -> None:
     expected = 0.2 * 100.0 / 2.0  # wavelength · focal / depth, whatever the direction
-    np.testing.assert_allclose(expected_wavelength_map([wall(angle=angle)], camera()), expected, rtol=1e-5)
+    actual = expected_wavelength_map([wall(angle=angle)], camera())
+    np.testing.assert_allclose(actual, expected, rtol=1e-5)
 
 
 def test_checker_wavelength_is_its_fundamental() -> None:
     checker = wall(texture="checker", wavelength=0.4)
-    np.testing.assert_allclose(expected_wavelength_map([checker], camera()), 0.4 * 100.0 / 2.0, rtol=1e-5)
+    actual = expected_wavelength_map([checker], camera())
+    np.testing.assert_allclose(actual, 0.4 * 100.0 / 2.0, rtol=1e-5)
     row = render([checker], camera(), 1)[0, :, 0]
     changes = np.flatnonzero(np.diff(row.astype(int)))
     np.testing.assert_allclose(np.diff(changes).mean(), 20.0 / np.sqrt(2.0), atol=1.0)  # a square's side
@@ -160,9 +177,13 @@ def test_wavelength_is_foreshortened_along_the_grating_only() -> None:
     along = np.array([np.cos(tilt), 0.0, np.sin(tilt)])
     tilted = wall(corner=np.array([0, -20.0, 2.0]) - 2 * along, edge_u=4 * along, edge_v=np.array([0, 40.0, 0]))
     view = View("view.png", np.eye(3), np.zeros(3), 100.0, 1, 1)  # its one pixel looks along z, at depth 2
-    assert expected_wavelength_map([tilted], view)[0, 0] == pytest.approx(10 * np.cos(tilt), rel=1e-5)
+    actual = expected_wavelength_map([tilted], view)[0, 0]
+    expected = pytest.approx(10 * np.cos(tilt), rel=1e-5)
+    assert actual == expected
     across = dataclasses.replace(tilted, angle=0.5 * np.pi)
-    assert expected_wavelength_map([across], view)[0, 0] == pytest.approx(10, rel=1e-5)
+    actual = expected_wavelength_map([across], view)[0, 0]
+    expected = pytest.approx(10, rel=1e-5)
+    assert actual == expected
 
 
 def test_wavelength_matches_the_drawn_image() -> None:
@@ -234,8 +255,10 @@ def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     assert write_gaussians(path, params) == 7
     vertex = PlyData.read(str(path))["vertex"]
     columns = [p.name for p in vertex.properties]
-    assert columns[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    assert columns[-8:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    expected = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    assert columns[:9] == expected
+    expected = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert columns[-8:] == expected
     assert len(columns) == 17 + 3 * bands
 
     def read(*names: str) -> np.ndarray:
@@ -245,10 +268,12 @@ def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     np.testing.assert_array_equal(read("opacity"), params["opacities"])
     np.testing.assert_array_equal(read("scale_0", "scale_1", "scale_2"), params["scales"])
     rotations = torch.nn.functional.normalize(params["quats"], dim=-1)
-    np.testing.assert_allclose(read("rot_0", "rot_1", "rot_2", "rot_3"), rotations, rtol=1e-6)
+    actual = read("rot_0", "rot_1", "rot_2", "rot_3")
+    np.testing.assert_allclose(actual, rotations, rtol=1e-6)
     for band in range(bands):
         names = [f"f_rest_{colour * bands + band}" for colour in range(3)]
-        np.testing.assert_array_equal(read(*names), params["features_rest"][:, band])
+        expected = params["features_rest"][:, band]
+        np.testing.assert_array_equal(read(*names), expected)
 
 
 def test_ply_drops_what_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -257,9 +282,9 @@ def test_ply_drops_what_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixt
     params["features_rest"][3, 2, 1] = torch.inf
     assert write_gaussians(tmp_path / "splat.ply", params) == 3
     assert "dropped 2 of 5 Gaussians" in capsys.readouterr().out
-    np.testing.assert_array_equal(
-        PlyData.read(str(tmp_path / "splat.ply"))["vertex"]["x"], params["means"][[0, 2, 4], 0]
-    )
+    actual = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]["x"]
+    expected = params["means"][[0, 2, 4], 0]
+    np.testing.assert_array_equal(actual, expected)
 
 
 def test_ply_names_the_tensor_of_another_shape(tmp_path: Path) -> None:

@@ -47,11 +47,16 @@ def of_glb(path: Path) -> tuple[Gaussians, dict[str, Any]]:
     """A GLB's Gaussians, and its JSON, whose parts are checked against the lengths that the container gives."""
     data = path.read_bytes()
     magic, version, total, length, kind = struct.unpack("<4sIIII", data[:20])
-    assert (magic, version, total, kind) == (b"glTF", 2, len(data), 0x4E4F534A)
+    assert magic == b"glTF"
+    assert version == 2
+    assert total == len(data)
+    assert kind == 0x4E4F534A
     document = json.loads(data[20 : 20 + length])
     size, kind = struct.unpack("<II", data[20 + length : 28 + length])
     binary = data[28 + length :]
-    assert length % 4 == 0 and kind == 0x004E4942 and size == len(binary) == document["buffers"][0]["byteLength"]
+    assert length % 4 == 0
+    assert kind == 0x004E4942
+    assert size == len(binary) == document["buffers"][0]["byteLength"]
 
     def array(index: int) -> NDArray[Any]:
         accessor = document["accessors"][index]
@@ -61,7 +66,8 @@ def of_glb(path: Path) -> tuple[Gaussians, dict[str, Any]]:
         return np.frombuffer(part, dtype).reshape(accessor["count"], -1)
 
     (primitive,) = document["meshes"][0]["primitives"]
-    assert "KHR_gaussian_splatting" in document["extensionsUsed"] and primitive["mode"] == 0
+    assert "KHR_gaussian_splatting" in document["extensionsUsed"]
+    assert primitive["mode"] == 0
     attributes = {name.rpartition(":")[2]: array(index) for name, index in primitive["attributes"].items()}
     rest = [attributes[f"SH_DEGREE_{d}_COEF_{m}"] for d in (1, 2, 3) for m in range(2 * d + 1)
             if f"SH_DEGREE_{d}_COEF_{m}" in attributes]  # fmt: skip
@@ -76,7 +82,8 @@ def of_glb(path: Path) -> tuple[Gaussians, dict[str, Any]]:
         "features_rest": np.stack(rest, 1) if rest else np.zeros((count, 0, 3)),
     }
     shown = np.c_[0.28209479 * attributes["SH_DEGREE_0_COEF_0"] + 0.5, alphas].clip(0, 1)
-    np.testing.assert_allclose(attributes["COLOR_0"] / 255, shown, atol=0.51 / 255)
+    actual = attributes["COLOR_0"] / 255
+    np.testing.assert_allclose(actual, shown, atol=0.51 / 255)
     return of_parameters(arrays), document
 
 
@@ -137,7 +144,8 @@ def test_our_reader_finds_the_gaussians_of_a_ply(bands: int, tmp_path: Path):
     assert vars(written).keys() == vars(found).keys()
     for name, values in vars(written).items():
         expected = vars(found)[name]
-        assert (values.shape, values.dtype) == (expected.shape, expected.dtype)
+        assert values.shape == expected.shape
+        assert values.dtype == expected.dtype
         np.testing.assert_allclose(values, expected, rtol=0, atol=1e-6 if name == "quats" else 0)
 
 
@@ -157,7 +165,8 @@ def test_few_gaussians_and_whole_chunks_are_written_too(suffix: str, count: int,
     formats.write(path, written)
     found = errors(written, read(path))
     bounds = BOUNDS[suffix] | ({"means": 6 / 1023} if suffix == ".compressed.ply" else {})
-    assert all(found[name] <= bounds[name] for name in bounds), found
+    for name in bounds:
+        assert found[name] <= bounds[name], found
 
 
 def test_the_harmonics_of_many_gaussians_are_found_again(tmp_path: Path):
@@ -174,7 +183,9 @@ def test_a_palette_stays_within_its_size(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sog, "_PALETTE", 100)
     vectors = np.random.default_rng(0).normal(size=(3000, 9)).astype(np.float32)
     sets, labels = sog.palette(vectors)
-    assert 80 <= len(sets) <= 100 and labels.min() == 0 and labels.max() == len(sets) - 1
+    assert 80 <= len(sets) <= 100
+    assert labels.min() == 0
+    assert labels.max() == len(sets) - 1
     error = np.square(sets[labels] - vectors).mean()
     assert error < 0.75, "the mean alone would leave 1"
 
@@ -183,7 +194,8 @@ def test_codebooks_serve_rare_values_too():
     values = np.r_[np.random.default_rng(0).normal(size=100_000), -20.0, 30.0].astype(np.float32)
     levels = packing.codebook(values)
     error = np.abs(levels[packing.nearest_level(values, levels)] - values)
-    assert error.max() < 1.0 and error[:-2].std() < 0.02
+    assert error.max() < 1.0
+    assert error[:-2].std() < 0.02
 
 
 def test_a_morton_order_keeps_neighbours_together():
@@ -220,7 +232,8 @@ def test_an_spz_says_that_its_axes_are_those_of_a_ply(tmp_path: Path):
     formats.write(tmp_path / "splat.spz", written)
     content = gzip.decompress((tmp_path / "splat.spz").read_bytes())
     assert content[14] == 2, "the flag of records at the end"
-    assert len(content) == 16 + 4 * (9 + 1 + 3 + 3 + 4 + 45) + 12
+    expected = 16 + 4 * (9 + 1 + 3 + 3 + 4 + 45) + 12
+    assert len(content) == expected
     assert struct.unpack("<III", content[-12:]) == (0xADBE0003, 4, 6)  # SPZ_ADOBE_coordinate_system, 4 bytes, RDF
     assert errors(written, read(tmp_path / "splat.spz"))["means"] <= 2.0**-20
 
@@ -232,7 +245,8 @@ def test_an_spz_says_that_its_axes_are_those_of_a_ply(tmp_path: Path):
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".spz", ".sog"])
 @pytest.mark.parametrize("program", ["@playcanvas/splat-transform@2.7.1", "@playcanvas/splat-transform@3.7.0"])
 def test_splat_transform_finds_the_same_gaussians_in_every_format(program: str, suffix: str, tmp_path: Path):
-    written, path = random_gaussians(300), tmp_path / f"splat{suffix}"
+    written = random_gaussians(300)
+    path = tmp_path / f"splat{suffix}"
     formats.write(path, written)
     command = ["npx", "--yes", program, "--quiet", str(path), str(tmp_path / "read.ply")]
     run = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
@@ -246,15 +260,20 @@ def test_splat_transform_finds_the_same_gaussians_in_every_format(program: str, 
 
 def test_values_beyond_a_format_s_range_are_cut_and_not_wrapped(tmp_path: Path):
     written = random_gaussians(300, 3)
-    written.opacities[:2], written.scales[:2] = [-50, 50], [[-40] * 3, [7] * 3]
-    written.features_rest[:2], written.features_dc[:2] = [[[-9.0] * 3] * 3, [[9.0] * 3] * 3], [[-9] * 3, [9] * 3]
+    written.opacities[:2] = [-50, 50]
+    written.scales[:2] = [[-40] * 3, [7] * 3]
+    written.features_rest[:2] = [[[-9.0] * 3] * 3, [[9.0] * 3] * 3]
+    written.features_dc[:2] = [[-9] * 3, [9] * 3]
     for suffix, low, high in ((".compressed.ply", -20, 7), (".spz", -10, 95 / 16 + 1e-6), (".sog", -40, 7)):
         formats.write(tmp_path / f"splat{suffix}", written)
         found = read(tmp_path / f"splat{suffix}")
         alphas = packing.sigmoid(found.opacities)
-        assert alphas.min() < 0.01 and alphas.max() > 0.99
-        assert low - 0.5 <= found.scales.min() <= low + 0.5 and high - 0.5 <= found.scales.max() <= high
-        assert found.features_rest.min() < -0.9 and found.features_rest.max() > 0.9
+        assert alphas.min() < 0.01
+        assert alphas.max() > 0.99
+        assert low - 0.5 <= found.scales.min() <= low + 0.5
+        assert high - 0.5 <= found.scales.max() <= high
+        assert found.features_rest.min() < -0.9
+        assert found.features_rest.max() > 0.9
         assert np.median(np.abs(found.features_rest)) < 0.2
 
 
@@ -311,7 +330,8 @@ def test_a_page_holds_the_gaussians_turned_for_the_viewer_and_the_start(
     up = Similarity(1.0, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
     assert errors(written.moved(up), found.moved(half_turn))["means"] < BOUNDS[".sog"]["means"]
     camera = bootstrap["settings"]["cameras"][0]["initial"]
-    assert camera == {"position": [0.0, 1.0, 2.0], "target": [0.0, 0.5, 0.0], "fov": 60.0}
+    expected = {"position": [0.0, 1.0, 2.0], "target": [0.0, 0.5, 0.0], "fov": 60.0}
+    assert camera == expected
     (track,) = bootstrap["settings"]["animTracks"]
     values = track["keyframes"]["values"]
     assert values == {"position": camera["position"], "target": camera["target"], "fov": [60.0]}
@@ -323,7 +343,8 @@ def test_the_title_of_a_page_is_that_of_its_context(monkeypatch: pytest.MonkeyPa
     for title, shown in (("", "SuperSplat Viewer"), (r"Tom & <Anna> \1 é", r"Tom &amp; &lt;Anna&gt; \1 é")):
         formats.write(tmp_path / "splat.html", random_gaussians(5), Context(start=START, title=title))
         page = (tmp_path / "splat.html").read_text("utf8")
-        assert page.startswith(f"<title>{shown}</title>") and page.endswith("</p><title>SuperSplat Viewer</title>")
+        assert page.startswith(f"<title>{shown}</title>")
+        assert page.endswith("</p><title>SuperSplat Viewer</title>")
 
 
 def test_a_page_begins_at_the_photo_in_the_middle():
@@ -336,11 +357,12 @@ def test_the_start_looks_where_the_camera_does_at_the_depth_of_what_is_there():
     pose = np.array([[1.0, 0, 0, 0], [0, 0, -1, -5], [0, 1, 0, 0]])  # It stands at y = −5 and looks along y.
     means = np.array([[0, -2, 0], [0.1, 0, 0], [0, 2, 0], [50, 0, 0], [0, -9, 0]], np.float32)
     start = html.start_at(pose, 200, 100.0, means)
-    np.testing.assert_allclose([*start.position, *start.target], [0, -5, 0, 0, 0, 0], atol=1e-6)
+    actual = [*start.position, *start.target]
+    expected = [0, -5, 0, 0, 0, 0]
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
     assert start.degrees == pytest.approx(90)
-    assert html.start_at(pose, 200, 100.0, means[4:]).target == (0, -4, 0), (
-        "where it sees nothing it looks one unit far"
-    )
+    actual = html.start_at(pose, 200, 100.0, means[4:]).target
+    assert actual == (0, -4, 0), "where it sees nothing it looks one unit far"
 
 
 def _raise(error: Exception) -> Callable[..., Any]:
@@ -398,7 +420,8 @@ def test_nothing_is_written_of_nothing(tmp_path: Path):
 def test_the_same_gaussians_make_the_same_bytes():
     gaussians = random_gaussians(300)
     for suffix in READ_BACK:
-        first, second = io.BytesIO(), io.BytesIO()
+        first = io.BytesIO()
+        second = io.BytesIO()
         formats.FORMATS[suffix](first, gaussians, Context())
         formats.FORMATS[suffix](second, gaussians, Context())
         assert first.getvalue() == second.getvalue()

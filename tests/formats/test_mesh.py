@@ -45,7 +45,8 @@ def a_mesh(vertices: np.ndarray, triangles: np.ndarray) -> TriangleMesh:
 
 def test_the_surface_lies_within_a_tenth_of_a_voxel_in_the_median(room: TriangleMesh):
     distances, which = nearest(ROOM, np.asarray(room.vertices))
-    assert np.median(distances) < 0.1 * VOXEL and np.quantile(distances, 0.9) < 0.3 * VOXEL
+    assert np.median(distances) < 0.1 * VOXEL
+    assert np.quantile(distances, 0.9) < 0.3 * VOXEL
     assert set(which) >= {index for index, surface in enumerate(ROOM) if "back" not in surface.name and "left" not in
                           surface.name}, "all that the views see has a part"  # fmt: skip
 
@@ -75,7 +76,8 @@ def test_vertices_have_the_colours_of_their_surface(room: TriangleMesh):
 
 def test_a_reflection_keeps_the_front(room: TriangleMesh):
     mirror = Similarity(2.0, np.diag([1.0, 1, -1]), np.array([0.0, 0, 5]))
-    vertices, normals = 2 * np.asarray(room.vertices) * [1, 1, -1] + [0, 0, 5], 4 * face_normals(room) * [1, 1, -1]
+    vertices = 2 * np.asarray(room.vertices) * [1, 1, -1] + [0, 0, 5]
+    normals = 4 * face_normals(room) * [1, 1, -1]
     moved = mesh.moved(type(room)(room), mirror)
     np.testing.assert_allclose(moved.vertices, vertices, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(face_normals(moved), normals, atol=1e-6)
@@ -96,7 +98,9 @@ def test_a_surface_needs_three_views_or_all_of_fewer(times: int, others: int, sh
 @pytest.mark.usefixtures("open3d")
 def test_nothing_and_what_is_far_behind_make_no_mesh():
     view = depth_view(ROOM, arc_views(1, 80, 60)[0])
-    nothing, far, between = np.zeros_like(view.depth), np.full_like(view.depth, 100.0), np.zeros_like(view.depth)
+    nothing = np.zeros_like(view.depth)
+    far = np.full_like(view.depth, 100.0)
+    between = np.zeros_like(view.depth)
     between[31, 41] = 2.0  # Open3D looks at every fourth pixel of every fourth row.
     for depth in (nothing, far, between):
         fusion = Fusion(VOXEL)
@@ -110,7 +114,8 @@ def test_nothing_and_what_is_far_behind_make_no_mesh():
 def test_voxels_that_do_not_fit_are_refused_before_they_take_memory(monkeypatch: pytest.MonkeyPatch):
     view = depth_view(ROOM, arc_views(1, 80, 60)[0])
     monkeypatch.setattr(mesh, "MOST_VOXELS", 50 * 16**3)
-    assert Fusion(0.5).has_room_for([view]) and not Fusion(0.05).has_room_for([view])
+    assert Fusion(0.5).has_room_for([view])
+    assert not Fusion(0.05).has_room_for([view])
     with pytest.raises(InputError, match=r"^A mesh of voxels of 0\.02 does not fit .*, such as --voxel-size 0\.04\.$"):
         Fusion(0.02).add(view)
 
@@ -118,7 +123,8 @@ def test_voxels_that_do_not_fit_are_refused_before_they_take_memory(monkeypatch:
 @pytest.mark.usefixtures("open3d")
 def test_parts_of_less_than_a_hundredth_of_the_largest_are_left_out():
     sides = [11, 1, 2]  # squares of the grids: 242, 2 and 8 triangles
-    vertices, triangles = [], []
+    vertices = []
+    triangles = []
     for number, side in enumerate(sides):
         x, y = np.meshgrid(np.arange(side + 1), np.arange(side + 1), indexing="ij")
         first = sum(map(len, vertices)) + (x[:-1, :-1] * (side + 1) + y[:-1, :-1]).ravel()
@@ -127,9 +133,12 @@ def test_parts_of_less_than_a_hundredth_of_the_largest_are_left_out():
         vertices.append(np.stack([x, y, np.full_like(x, number)], -1).reshape(-1, 3))
     kept = mesh.without_small_parts(a_mesh(np.concatenate(vertices), np.concatenate(triangles)))
     left = np.asarray(kept.vertices)
-    assert set(left[:, 2]) == {0, 2} and len(kept.triangles) == 242 + 8
-    assert len(left) == 12 * 12 + 3 * 3 and (left == 20 * np.asarray(kept.vertex_colors)).all()
-    np.testing.assert_allclose(np.linalg.norm(face_normals(kept), axis=1), 1)
+    assert set(left[:, 2]) == {0, 2}
+    assert len(kept.triangles) == 242 + 8
+    assert len(left) == 12 * 12 + 3 * 3
+    assert (left == 20 * np.asarray(kept.vertex_colors)).all()
+    actual = np.linalg.norm(face_normals(kept), axis=1)
+    np.testing.assert_allclose(actual, 1)
 
 
 @pytest.mark.usefixtures("open3d")

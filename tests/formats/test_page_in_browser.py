@@ -22,7 +22,8 @@ START = Start((1.0, -8.0, 2.0), (0.5, 0.5, 0.5), 60.0)
 
 def render(gaussians: Gaussians, width: int, height: int) -> np.ndarray:
     """What an upright camera sees from the start, in [0, 1]. [H, W, 3]"""
-    position, target = np.array(START.position), np.array(START.target)
+    position = np.array(START.position)
+    target = np.array(START.target)
     forward = (target - position) / np.linalg.norm(target - position)
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)

@@ -34,18 +34,24 @@ def test_the_lock_file_pins_every_package_by_its_hash_and_names_no_server():
     lock = json.loads((page_writer.PACKAGES / "package-lock.json").read_text())
     packages = {name: package for name, package in lock["packages"].items() if name}
     wanted = json.loads((page_writer.PACKAGES / "package.json").read_text())["dependencies"]
-    assert lock["packages"][""]["dependencies"] == wanted and str(page_writer.PROGRAM).split("/bin/")[0] in packages
-    assert all(package["integrity"].startswith("sha512-") for package in packages.values())
-    assert not any("resolved" in package for package in packages.values())
+    assert lock["packages"][""]["dependencies"] == wanted
+    assert str(page_writer.PROGRAM).split("/bin/")[0] in packages
+    for package in packages.values():
+        assert package["integrity"].startswith("sha512-")
+    for package in packages.values():
+        assert "resolved" not in package
 
 
 def test_the_program_is_installed_once_without_running_scripts_of_its_packages(cache: Path):
     assert not page_writer.is_installed()
     page_writer.install()
     page_writer.install()
-    assert page_writer.is_installed() and list(cache.iterdir()) == [page_writer.folder()]
+    assert page_writer.is_installed()
+    assert list(cache.iterdir()) == [page_writer.folder()]
     ran = (page_writer.folder() / "ran.txt").read_text().splitlines()
-    assert len(ran) == 1 and ran[0].startswith("ci ") and "--ignore-scripts" in ran[0]
+    assert len(ran) == 1
+    assert ran[0].startswith("ci ")
+    assert "--ignore-scripts" in ran[0]
 
 
 def test_a_program_that_another_process_installed_meanwhile_is_taken(cache: Path, monkeypatch: pytest.MonkeyPatch):
@@ -86,4 +92,5 @@ def test_a_page_is_made_by_default_if_its_program_is_there_or_the_user_lets_it_b
     assert choose_formats("html,ply", False, console) == ["ply", "html"], "who names the format wants the download"
     page_writer.install()
     questions.clear()
-    assert choose_formats(None, False, console) == ["ply", "html"] and questions == []
+    assert choose_formats(None, False, console) == ["ply", "html"]
+    assert questions == []

@@ -35,7 +35,9 @@ def haze(paths: CameraPaths, *places: tuple[float, float, float], scale: float =
 
 def reference(paths: CameraPaths, points: Tensor, means: Tensor, scales: Tensor) -> Tensor:
     """`CameraPaths.haze` in float64, Gaussian by Gaussian and path by path."""
-    found, points, starts = [], points.double(), paths.starts.double()
+    found = []
+    points = points.double()
+    starts = paths.starts.double()
     ways = paths.ends.double() - starts
     for mean, axes in zip(means.double(), scales.double(), strict=True):
         _, width, length = sorted(axes.tolist())
@@ -70,11 +72,13 @@ def test_gaussians_of_surfaces_stay_however_near_the_path_leads_them():
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, 2, 3] = -6.0
     paths = CameraPaths.of(viewmats, NEAR, wall(3.0))  # The path leads through the wall.
-    assert haze(paths, (1.0, 1.0, 3.1), (1.0, 1.0, 2.7), (1.0, 1.0, 1.0)) == [False, False, True]
+    actual = haze(paths, (1.0, 1.0, 3.1), (1.0, 1.0, 2.7), (1.0, 1.0, 1.0))
+    assert actual == [False, False, True]
     assert haze(paths, (0.1, 0.1, 3.1)) == [True]
     beside = wall(0.0)[:, [0, 2, 1]] + torch.tensor([0.0, -1.0, 0.0])
     paths = CameraPaths.of(row_of_cameras(), NEAR, beside)
-    assert haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5), scale=0.4) == [False, True]
+    actual = haze(paths, (3.0, -1.1, 0.5), (3.0, 1.1, 0.5), scale=0.4)
+    assert actual == [False, True]
 
 
 @pytest.mark.hard_case(
@@ -101,10 +105,13 @@ def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
     means = (torch.rand((3000, 3), generator=generator) - 0.5) * size + torch.tensor([views - 1.0, 0.0, 0.0])
     scales = 10 ** (2 * torch.rand((3000, 3), generator=generator) - 1.5)
     paths = CameraPaths.of(viewmats, near, points)
-    numbers, addcmul = [], torch.addcmul
+    numbers = []
+    addcmul = torch.addcmul
     monkeypatch.setattr(torch, "addcmul", lambda a, *b, **c: (numbers.append(a.numel()), addcmul(a, *b, **c))[1])
-    found, expected = paths.haze(means, scales), reference(paths, points, means, scales)
-    assert torch.equal(found, expected) and 300 < int(expected.sum()) < 1500
+    found = paths.haze(means, scales)
+    expected = reference(paths, points, means, scales)
+    assert torch.equal(found, expected)
+    assert 300 < int(expected.sum()) < 1500
     if views > 100:
         assert sum(numbers) < 0.1 * 3 * len(means) * len(paths.starts), "runs of thousands of views would wait for it"
 
@@ -112,7 +119,8 @@ def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
 def test_a_scene_in_other_units_has_the_same_haze(factor: float):
     generator = torch.Generator().manual_seed(1)
-    viewmats, points = row_of_cameras(), wall(4.0)
+    viewmats = row_of_cameras()
+    points = wall(4.0)
     means = 12 * torch.rand((500, 3), generator=generator) - torch.tensor([1.0, 6.0, 6.0])
     scales = torch.rand((500, 3), generator=generator)
     expected = CameraPaths.of(viewmats, NEAR, points).haze(means, scales)
@@ -129,17 +137,19 @@ def test_paths_lead_to_the_nearest_cameras_that_look_in_a_similar_direction():
     paths = CameraPaths.of(viewmats, NEAR, wall(8.0))
     lengths = (paths.ends - paths.starts).norm(dim=1)
     assert (lengths == 0).sum() == 7, "each camera is a path of its own"
-    assert (
-        len({tuple(row) for row in torch.cat([paths.starts, paths.ends], 1)[lengths > 0].tolist()}) == len(lengths) - 7
-    )
-    assert paths.ends[lengths > 0].amax() == 10 and lengths.max() == 8
-    assert haze(paths, (12.0, 0.0, 2.5), (11.0, 2.85, 0.0)) == [True, False]
+    actual = len({tuple(row) for row in torch.cat([paths.starts, paths.ends], 1)[lengths > 0].tolist()})
+    assert actual == len(lengths) - 7
+    assert paths.ends[lengths > 0].amax() == 10
+    assert lengths.max() == 8
+    actual = haze(paths, (12.0, 0.0, 2.5), (11.0, 2.85, 0.0))
+    assert actual == [True, False]
 
 
 @pytest.mark.hard_case("panoramas in parts, several cameras in one place", "paths lead to the other places")
 def test_paths_lead_from_cameras_in_one_place_to_those_in_others():
     viewmats = row_of_cameras(2, spacing=8.0).repeat_interleave(6, dim=0)
-    assert haze(CameraPaths.of(viewmats, NEAR, wall(8.0)), (4.0, 0.0, 0.5)) == [True]
+    actual = haze(CameraPaths.of(viewmats, NEAR, wall(8.0)), (4.0, 0.0, 0.5))
+    assert actual == [True]
 
 
 @pytest.mark.hard_case(
@@ -149,17 +159,21 @@ def test_paths_lead_from_cameras_in_one_place_to_those_in_others():
 def test_no_path_leads_to_cameras_that_are_far_away(distance: float, between: bool):
     viewmats = row_of_cameras(3).repeat(2, 1, 1)
     viewmats[3:, 2, 3] = -distance
-    assert haze(CameraPaths.of(viewmats, NEAR, wall(-8.0)), (2.0, 0.0, distance / 2)) == [between]
+    actual = haze(CameraPaths.of(viewmats, NEAR, wall(-8.0)), (2.0, 0.0, distance / 2))
+    assert actual == [between]
     apart = row_of_cameras(3, spacing=distance)  # Cameras that all stand far apart are neighbours.
-    assert haze(CameraPaths.of(apart, NEAR, wall(-8.0)), (distance / 2, 0.0, 0.5)) == [True]
+    actual = haze(CameraPaths.of(apart, NEAR, wall(-8.0)), (distance / 2, 0.0, 0.5))
+    assert actual == [True]
 
 
 @pytest.mark.parametrize("points", [0, 3])
 def test_a_single_camera_or_two_in_one_place_have_a_space_all_the_same(points: int):
     for number in (1, 2):
         paths = CameraPaths.of(row_of_cameras(number, spacing=0.0), NEAR, wall(8.0)[:points])
-        assert haze(paths, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0)) == [True, False]
-        assert len(paths.haze(torch.zeros(0, 3), torch.zeros(0, 3))) == 0
+        actual = haze(paths, (0.0, 0.0, 1.0), (0.0, 0.0, 4.0))
+        assert actual == [True, False]
+        actual = len(paths.haze(torch.zeros(0, 3), torch.zeros(0, 3)))
+        assert actual == 0
 
 
 @pytest.mark.parametrize("iteration", [300, 500, 1600], ids=["AbsGS", "structure", "last"])
@@ -175,9 +189,12 @@ def test_densification_steps_prune_haze_and_the_last_one_keeps_the_paths_for_a_r
     }
     state.update(empty_state(3, torch.device("cpu")))
     strategy.step_post_backward(params, optimizers, state, iteration - 1, [])
-    assert params["means"].tolist() == means[1:].tolist() and "camera_paths" in state
+    assert params["means"].tolist() == means[1:].tolist()
+    assert "camera_paths" in state
     for step in state.get("structure_steps", []):
-        assert (step["before"], step["pruned"], step["after"]) == (3, 1, 2)
+        assert step["before"] == 3
+        assert step["pruned"] == 1
+        assert step["after"] == 2
     params["means"].data[0] = means[0]  # Haze that arises later
     strategy.for_run(3000).prune_haze(params, optimizers, state)
     assert params["means"].tolist() == means[2:].tolist()

@@ -11,7 +11,9 @@ from torch import Tensor
 from helpers.small_scenes import camera, random_params
 from sadgs_ns.geometry.cleaning import Cleaning, Visibility, choose_remaining, measure_visibility
 
-WIDTH, HEIGHT, FOCAL = 64, 48, 60.0
+WIDTH = 64
+HEIGHT = 48
+FOCAL = 60.0
 
 
 def view(x: float = 0.0) -> tuple[Tensor, Tensor, int, int]:
@@ -38,15 +40,18 @@ def test_a_view_sees_opacity_times_area():
     sigma = FOCAL * 0.2 / 4
     expected = 2 * math.pi * (sigma**2 + 0.3) * (0.5 - 1 / 255)  # 0.3 px² is the rasterizer's blur.
     assert float(seen.pixels) == pytest.approx(expected, rel=0.02)
-    assert seen.views.tolist() == [1] and seen.total == 1
+    assert seen.views.tolist() == [1]
+    assert seen.total == 1
 
 
 def test_what_is_hidden_or_outside_the_image_is_not_seen():
     wall = [((0, 0, 3.0 + 0.01 * i), 2.0, 0.99) for i in range(4)]
     params = balls(*wall, ((0, 0, 6), 0.1, 0.9), ((30, 0, 6), 0.1, 0.9), ((0, 0, -4), 0.1, 0.9))
     seen = measure_visibility(params, [view(), view(0.1)])
-    assert seen.views.tolist()[4:] == [0, 0, 0] and seen.pixels[4:].amax() < 1 / 255
-    assert seen.views.tolist()[0] == 2 and seen.pixels[0] > 0.5 * WIDTH * HEIGHT
+    assert seen.views.tolist()[4:] == [0, 0, 0]
+    assert seen.pixels[4:].amax() < 1 / 255
+    assert seen.views.tolist()[0] == 2
+    assert seen.pixels[0] > 0.5 * WIDTH * HEIGHT
 
 
 def test_the_views_are_counted_and_the_most_pixels_kept():
@@ -63,15 +68,20 @@ def test_looking_changes_nothing_and_needs_no_gradients():
     before = {name: value.detach().clone() for name, value in params.items()}
     with torch.no_grad():
         seen = measure_visibility(params, [view()])
-    assert not seen.pixels.requires_grad and all(value.grad is None for value in params.values())
-    assert all(torch.equal(before[name], params[name]) for name in before)
+    assert not seen.pixels.requires_grad
+    for value in params.values():
+        assert value.grad is None
+    for name in before:
+        assert torch.equal(before[name], params[name])
     assert int(seen.views.sum()) > 25
 
 
 def test_what_is_not_finite_is_not_seen_and_hides_nothing():
     params = balls(*[((0.0, 0.0, 4.0), 0.2, 0.5)] * 4)
     expected = measure_visibility(balls(((0, 0, 4), 0.2, 0.5)), [view()]).pixels
-    params["means"][0, 0], params["scales"][1, 1], params["opacities"][2, 0] = math.nan, math.inf, math.nan
+    params["means"][0, 0] = math.nan
+    params["scales"][1, 1] = math.inf
+    params["opacities"][2, 0] = math.nan
     seen = measure_visibility(params, [view()])
     assert seen.views.tolist() == [0, 0, 0, 1]
     torch.testing.assert_close(seen.pixels[3:], expected)

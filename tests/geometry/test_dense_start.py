@@ -11,7 +11,8 @@ from torch import Tensor
 from sadgs_ns.geometry.dense_start import SCALE, DensePoints, dense_points
 from sadgs_ns.geometry.stereo import DepthMap
 
-HEIGHT, WIDTH = 240, 320
+HEIGHT = 240
+WIDTH = 320
 SIZE = torch.tensor([WIDTH, HEIGHT])
 K = torch.tensor([[380, 0, 150], [0, 350, 125], [0, 0, 1]]).double()
 NORMAL = torch.tensor([0.2, 0.1, 1.0]).double()
@@ -31,7 +32,8 @@ class Views:
         for v in range(4):
             rotation = torch.matrix_exp(0.03 * v * torch.tensor([[0, 0, 1], [0, 0, 0], [-1, 0, 0]]).double())
             centre = torch.tensor([0.7 * v - 1, 0.2 * (v % 2), 0.1 * v]).double()
-            self.viewmats[v, :3, :3], self.viewmats[v, :3, 3] = rotation, -rotation @ centre
+            self.viewmats[v, :3, :3] = rotation
+            self.viewmats[v, :3, 3] = -rotation @ centre
             rays = torch.stack([x, y, torch.ones_like(x)], dim=2).double() @ K.inverse().T @ rotation
             depth = (10 - centre @ NORMAL) / (rays @ NORMAL)
             self.maps.append(DepthMap(depth.float(), torch.ones_like(x), K.float()))
@@ -45,37 +47,45 @@ class Views:
     def look_at(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Pixels of points in each view [V, Q, 2], their depths, and whether they lie in its picture. Each [V, Q]"""
         local = points.double() @ self.viewmats[:, :3, :3].mT + self.viewmats[:, None, :3, 3]
-        pixels, depths = (local @ K.T)[..., :2] / local[..., 2:], local[..., 2]
+        pixels = (local @ K.T)[..., :2] / local[..., 2:]
+        depths = local[..., 2]
         return pixels, depths, ((pixels >= 0) & (pixels < SIZE)).all(dim=2) & (depths > 0)
 
     def check_colors(self, drawn: DensePoints, agreeing: Tensor) -> None:
         """Colours are the means over views [V, Q]; points at the border of a picture may be counted otherwise."""
         pixels = self.look_at(drawn.means)[0]
         sure = torch.minimum(pixels.abs(), (pixels - SIZE).abs()).amin(dim=(0, 2)) > 0.01
-        assert sure.double().mean() > 0.9 and agreeing.sum(dim=0)[sure].min() >= 2
+        assert sure.double().mean() > 0.9
+        assert agreeing.sum(dim=0)[sure].min() >= 2
         expected = agreeing.float().T @ COLORS / agreeing.sum(dim=0)[:, None]
-        torch.testing.assert_close(drawn.colors[sure], expected[sure], rtol=0, atol=1e-5)
+        actual = drawn.colors[sure]
+        torch.testing.assert_close(actual, expected[sure], rtol=0, atol=1e-5)
 
 
 def test_points_lie_on_the_surface_with_the_mean_colour_of_the_views_that_see_them():
     views = Views()
     views.viewmats[3, ::2] *= -1  # The last camera looks the other way, with a map of what nobody else sees.
     drawn = views.draw()
-    assert [tuple(values.shape) for values in drawn] == [(2000, 3), (2000, 3), (2000,)]
+    actual = [tuple(values.shape) for values in drawn]
+    expected = [(2000, 3), (2000, 3), (2000,)]
+    assert actual == expected
     assert (drawn.means.double() @ NORMAL - 10).abs().max() < 1e-4
     seen = views.look_at(drawn.means)[2]
-    assert set(seen.sum(dim=0).tolist()) == {2, 3} and not seen[3].any()
+    assert set(seen.sum(dim=0).tolist()) == {2, 3}
+    assert not seen[3].any()
     views.check_colors(drawn, seen)
 
 
 def test_scales_are_half_a_wavelength_and_at_least_half_a_pixel_of_the_depth_map():
-    views, wavelengths = Views(), torch.tensor([[1.0], [2.0], [3.0], [4.0]])  # px of the depth map
+    views = Views()
+    wavelengths = torch.tensor([[1.0], [2.0], [3.0], [4.0]])  # px of the depth map
     of_images = [1.0, 4.0, 6.0, 8.0]  # The images are twice as large, and the first wavelength is less than a pixel.
     means, _, scales = views.draw([torch.full((2 * HEIGHT, 2 * WIDTH), length) for length in of_images])
     pixels, depths, _ = views.look_at(means)
     own = ((pixels.frac() - 0.5).abs() < 1e-3).all(dim=2)  # A point lies at the centre of its own view's pixel.
     fits = own & ((scales / (SCALE * wavelengths * depths / K[0, 0]) - 1).abs() < 1e-4)
-    assert fits.any(dim=0).all() and fits.any(dim=1).all()
+    assert fits.any(dim=0).all()
+    assert fits.any(dim=1).all()
 
 
 @pytest.mark.parametrize(("length", "ratio"), [(2.0, 4.0), (4.0, 1.0)])
@@ -103,28 +113,35 @@ def test_a_view_has_a_say_if_its_depth_fits_and_points_if_it_is_sure_too(ratio: 
     pixels, _, seen = views.look_at(drawn.means)
     seen[2] &= say > 0
     views.check_colors(drawn, seen)
-    assert bool(((pixels[2].frac() - 0.5).abs() < 1e-3).all(dim=1).any()) == (say > 1), "its own points"
+    actual = bool(((pixels[2].frac() - 0.5).abs() < 1e-3).all(dim=1).any())
+    assert actual == (say > 1), "its own points"
 
 
 def test_nothing_is_drawn_without_confident_depth_of_two_views_or_from_pixels_without_a_wavelength():
     views = Views()
     half = views.draw([torch.where(left, torch.nan, 3.0) for left in views.left]).means
-    assert len(half) == 2000 and half[:, 0].min() > -1e-4
+    assert len(half) == 2000
+    assert half[:, 0].min() > -1e-4
     masked = views.draw([torch.full((HEIGHT, WIDTH), torch.nan)] * 4)
     for v in (1, 2, 3):
         views.maps[v].confidence.zero_()
     alone = views.draw()
     views.maps[0].confidence.zero_()
     for empty in (masked, alone, views.draw()):
-        assert [tuple(values.shape) for values in empty] == [(0, 3), (0, 3), (0,)]
+        actual = [tuple(values.shape) for values in empty]
+        expected = [(0, 3), (0, 3), (0,)]
+        assert actual == expected
 
 
 def test_points_depend_on_no_generator_but_their_own_and_are_no_more_than_asked_for():
-    views, before = Views(), torch.random.get_rng_state()
+    views = Views()
+    before = torch.random.get_rng_state()
     first = views.draw(seed=1)
-    assert torch.equal(torch.random.get_rng_state(), before) and len(first.means.unique(dim=0)) == 2000
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert len(first.means.unique(dim=0)) == 2000
     torch.manual_seed(5)
-    assert all(torch.equal(a, b) for a, b in zip(first, views.draw(seed=1), strict=True))
+    for a, b in zip(first, views.draw(seed=1), strict=True):
+        assert torch.equal(a, b)
     assert not torch.equal(first.means, views.draw(seed=2).means)
     assert 0 < len(views.draw(number=7).means) <= 7
     assert 2000 < len(views.draw(number=10**6).means) < 4 * HEIGHT * WIDTH

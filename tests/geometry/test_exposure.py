@@ -8,7 +8,9 @@ import pytest
 from sadgs_ns.geometry import exposure
 from sadgs_ns.geometry.exposure import FEWEST_POINTS, Observations, fit_exposures, gains_of_others, points_at_median
 
-VIEWS, POINTS, TRACK = 12, 800, 5
+VIEWS = 12
+POINTS = 800
+TRACK = 5
 
 
 def drawn(
@@ -30,7 +32,8 @@ def test_known_gains_and_colours_are_found_and_the_median_gain_is_1():
     found = fit_exposures(observations, VIEWS, POINTS)
     assert found.known.all()
     np.testing.assert_allclose(found.stops, gains, atol=0.03)
-    np.testing.assert_allclose(np.median(found.stops, axis=0), 0, atol=1e-12)
+    actual = np.median(found.stops, axis=0)
+    np.testing.assert_allclose(actual, 0, atol=1e-12)
     assert np.abs(found.points - colors).mean() < 0.05
     means = gains.mean(axis=1)
     assert found.deviation == pytest.approx(means.std(), abs=0.02)
@@ -44,7 +47,8 @@ def test_gains_withstand_a_fifth_of_wrong_observations():
     generator = np.random.default_rng(1)
     wrong = generator.random(len(observations.views)) < 0.2
     observations.stops[wrong] += generator.uniform(-3, 3, (int(wrong.sum()), 3))
-    np.testing.assert_allclose(fit_exposures(observations, VIEWS, POINTS).stops, gains, atol=0.05)
+    actual = fit_exposures(observations, VIEWS, POINTS).stops
+    np.testing.assert_allclose(actual, gains, atol=0.05)
 
 
 @pytest.mark.hard_case("a photo that shares few points with others", "has a gain of 1, and moves no other gain")
@@ -59,7 +63,8 @@ def test_a_photo_with_few_points_has_a_gain_of_1_and_does_not_move_the_others():
         Observations(observations.views[kept], observations.points[kept], observations.stops[kept]), VIEWS, POINTS
     )
     others = np.arange(VIEWS) != 3
-    assert found.known.tolist() == others.tolist() and not found.stops[3].any()
+    assert found.known.tolist() == others.tolist()
+    assert not found.stops[3].any()
     expected = gains[others] - np.median(gains[others], axis=0)
     np.testing.assert_allclose(found.stops[others], expected, atol=0.05)
 
@@ -67,7 +72,8 @@ def test_a_photo_with_few_points_has_a_gain_of_1_and_does_not_move_the_others():
 def test_photos_with_one_exposure_have_no_spread_beyond_noise():
     observations, _, _ = drawn(spread=0.0)
     found = fit_exposures(observations, VIEWS, POINTS)
-    assert found.deviation < 0.01 and found.spread < 0.03
+    assert found.deviation < 0.01
+    assert found.spread < 0.03
     assert found.residual_after > 0.97 * found.residual_before
 
 
@@ -75,7 +81,9 @@ def test_photos_with_one_exposure_have_no_spread_beyond_noise():
 def test_without_common_points_all_gains_are_1(count: int):
     views = np.arange(3 * count)
     found = fit_exposures(Observations(views, np.zeros_like(views), np.zeros((len(views), 3))), 3, 1)
-    assert not found.known.any() and not found.stops.any() and found.deviation == found.spread == 0
+    assert not found.known.any()
+    assert not found.stops.any()
+    assert found.deviation == found.spread == 0
     assert np.isnan(found.points).all()
 
 
@@ -86,7 +94,8 @@ def test_photos_that_were_not_fitted_get_gains_by_the_points_colours():
     light = points_at_median(observations.of_views(fitted), stops, POINTS)
     found, known = gains_of_others(observations.of_views(~fitted), light, VIEWS)
     assert known.tolist() == (~fitted).tolist()
-    np.testing.assert_allclose(found, np.where(fitted[:, None], 0.0, gains), atol=0.03)
+    expected = np.where(fitted[:, None], 0.0, gains)
+    np.testing.assert_allclose(found, expected, atol=0.03)
 
 
 def test_many_observations_are_thinned_out_by_points(monkeypatch: pytest.MonkeyPatch):

@@ -19,7 +19,8 @@ def test_one_wild_camera_does_not_decide_the_extent():
     positions = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
     expected = camera_extent(positions)
     for far in (1e2, 1e6, 1e30, torch.inf, torch.nan):
-        assert camera_extent(torch.cat([positions, torch.full((1, 3), far)])) == expected
+        actual = camera_extent(torch.cat([positions, torch.full((1, 3), far)]))
+        assert actual == expected
 
 
 @pytest.mark.hard_case("one wild SfM point", "is left out and counted; all others stay")
@@ -34,7 +35,8 @@ def test_a_wild_point_is_not_plausible_and_all_others_are(number: int, far: list
 @pytest.mark.hard_case("a sound cloud with a far background", "all points stay")
 def test_a_sound_cloud_with_a_far_background_is_plausible():
     generator = torch.Generator().manual_seed(0)
-    near, background = (torch.randn((number, 3), generator=generator) for number in (1_000, 50))
+    near = torch.randn((1_000, 3), generator=generator)
+    background = torch.randn((50, 3), generator=generator)
     assert plausible_points(torch.cat([near, 50 * background])).all()
     assert plausible_points(torch.zeros((9, 3))).all()
     assert plausible_points(torch.tensor([[0.0, 0, 0]] * 9 + [[5.0, 0, 0]])).all()  # most coincide

@@ -23,8 +23,10 @@ def test_points_lie_on_the_six_faces():
     assert faces.shape == (6 * 16, 3)
     high = torch.tensor([1.0, 2.0, 3.0])
     on_face = (faces == 0) | (faces == high)
-    assert (on_face.sum(1) == 1).all() and on_face.sum(0).tolist() == [32, 32, 32]
-    assert (faces >= 0).all() and (faces <= high).all()
+    assert (on_face.sum(1) == 1).all()
+    assert on_face.sum(0).tolist() == [32, 32, 32]
+    assert (faces >= 0).all()
+    assert (faces <= high).all()
     assert spacing == pytest.approx(2.0 / 4)
 
 
@@ -50,18 +52,23 @@ def test_few_or_equal_points_have_finite_log_scales(points: list[list[float]]):
 def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them():
     points, colors = torch.rand((2, 20, 3), generator=torch.Generator().manual_seed(0))
     alone = starting_points(points, colors, faces=False)
-    assert alone[0] is points and alone[1] is colors and (alone[3] == 0.1).all()
+    assert alone[0] is points
+    assert alone[1] is colors
+    assert (alone[3] == 0.1).all()
     torch.testing.assert_close(alone[2], neighbour_scales(points))
     faces, spacing = bounding_box_points(points)
     for value, before, added in zip(
         starting_points(points, colors, faces=True), alone, (faces, 0.5, spacing, 0.05), strict=True
     ):
-        assert torch.equal(value[:20], before) and len(value) == 20 + len(faces)
-        torch.testing.assert_close(value[20:], torch.as_tensor(added).expand_as(value[20:]))
+        assert torch.equal(value[:20], before)
+        assert len(value) == 20 + len(faces)
+        expected = torch.as_tensor(added).expand_as(value[20:])
+        torch.testing.assert_close(value[20:], expected)
 
 
 def test_images_of_few_pixels_bound_the_start_and_usual_ones_do_not():
-    lund_small, usual = 29 * 320 * 240, 5 * 1600 * 1200
+    lund_small = 29 * 320 * 240
+    usual = 5 * 1600 * 1200
     assert most_starting_points(lund_small, 0.02) == 44_544
     assert face_grid(lund_small, 0.02) == 8
     assert face_grid(24 * 124 * 93, 0.02) == 3
@@ -79,4 +86,6 @@ def test_coarser_faces_have_larger_points():
     coarse = starting_points(points, colors, faces=True, grid=4)
     assert len(fine[0]) == 20 + 6 * 16**2
     assert len(coarse[0]) == 20 + 6 * 4**2
-    torch.testing.assert_close(coarse[2][-1], 4 * fine[2][-1])
+    actual = coarse[2][-1]
+    expected = 4 * fine[2][-1]
+    torch.testing.assert_close(actual, expected)

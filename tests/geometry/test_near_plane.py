@@ -69,7 +69,8 @@ def test_a_few_wrong_points_before_a_camera_do_not_move_the_plane():
 
 
 def test_points_behind_and_beside_the_cameras_do_not_count():
-    behind, beside = wall(-0.1), wall(0.2, middle=-9.0, width=2.0)
+    behind = wall(-0.1)
+    beside = wall(0.2, middle=-9.0, width=2.0)
     points = torch.cat([behind, beside, wall(8.0)])
     assert scene_near_plane(points, *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
 
@@ -110,7 +111,8 @@ def looking_at_the_origin(centres: Tensor) -> Tensor:
 def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_with_it():
     viewmats, Ks, _ = row_of_cameras(1)
     means = torch.tensor([[0.0, 0, 8], [0, 0, 0.1]])
-    scales, opacities = torch.tensor([[2.0] * 3, [0.1] * 3]), torch.tensor([0.9, 0.3])
+    scales = torch.tensor([[2.0] * 3, [0.1] * 3])
+    opacities = torch.tensor([0.9, 0.3])
     colors = torch.tensor([[0.2, 0.4, 0.6], [1.0, 1.0, 1.0]])
     quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1)
 

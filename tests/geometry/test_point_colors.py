@@ -26,7 +26,8 @@ def picture() -> torch.Tensor:
 
 def seen(image: torch.Tensor, points: torch.Tensor, mask: torch.Tensor | None = None) -> list[int]:
     indices, stops = observe_points(image, mask, FACING, K, points, visible=True)
-    assert len(stops) == len(indices) and stops.isfinite().all()
+    assert len(stops) == len(indices)
+    assert stops.isfinite().all()
     return indices.tolist()
 
 
@@ -59,7 +60,8 @@ def test_a_pixel_that_is_clipped_dark_masked_or_transparent_leaves_the_point_out
     assert seen(picture(), points, mask) == [0]
     opaque = torch.full((SIZE, SIZE, 1), 255, dtype=torch.uint8)
     opaque[5, 5] = 254
-    assert seen(torch.cat([picture(), opaque], dim=2), points) == [0]
+    actual = seen(torch.cat([picture(), opaque], dim=2), points)
+    assert actual == [0]
 
 
 def test_without_tracks_points_behind_others_are_left_out():
@@ -77,7 +79,8 @@ def test_gains_of_light_are_affine_maps_of_srgbs_values_but_the_darkest():
         exact = srgb_values(linear_light(values) * 2**stops)
         image = torch.from_numpy(np.stack([values] * 3, axis=-1))
         mapped = apply_gains(image, srgb_gains(torch.full((3,), stops, dtype=torch.float64)))
-        np.testing.assert_allclose(mapped[:, 0].numpy(), exact, atol=0.004)
+        actual = mapped[:, 0].numpy()
+        np.testing.assert_allclose(actual, exact, atol=0.004)
     back = apply_gains(mapped, 1 / srgb_gains(torch.full((3,), stops, dtype=torch.float64)))
     torch.testing.assert_close(back, image)
 
@@ -86,5 +89,7 @@ def test_transparent_colours_change_as_much_as_they_cover():
     gains = srgb_gains(torch.tensor([1.0, 0.0, -1.0]))
     color = torch.tensor([[0.6, 0.4, 0.2]])
     alpha = torch.tensor([[0.25]])
-    torch.testing.assert_close(apply_gains(alpha * color, gains, alpha), alpha * apply_gains(color, gains))
+    actual = apply_gains(alpha * color, gains, alpha)
+    expected = alpha * apply_gains(color, gains)
+    torch.testing.assert_close(actual, expected)
     assert not apply_gains(torch.zeros((1, 3)), gains, torch.zeros((1, 1))).any()

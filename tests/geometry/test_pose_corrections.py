@@ -48,7 +48,8 @@ def matrix(rotation_vector: Tensor) -> Tensor:
 @pytest.mark.parametrize("length", [0.0, 1e-30, 1e-12, 1e-5, 1e-3, 0.1, 0.2236, 0.2237, 1.0, 3.0])
 def test_the_exponential_map_and_its_gradient_are_exact_to_rounding_at_every_angle(length: float):
     vector = torch.nn.functional.normalize(torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64), dim=0) * length
-    torch.testing.assert_close(poses.rotations(vector), matrix(vector), rtol=0, atol=2e-15)
+    actual = poses.rotations(vector)
+    torch.testing.assert_close(actual, matrix(vector), rtol=0, atol=2e-15)
     upstream = random(3, 3, seed=2)
 
     def gradient(value: Tensor) -> Tensor:
@@ -65,8 +66,12 @@ def test_the_exponential_map_and_its_gradient_are_exact_to_rounding_at_every_ang
     assert exact.grad is not None
     torch.testing.assert_close(gradient(vector), exact.grad, rtol=0, atol=1e-13)
     rounded = vector.float()
-    torch.testing.assert_close(poses.rotations(rounded).double(), matrix(rounded.double()), rtol=0, atol=4 * EPS32)
-    torch.testing.assert_close(gradient(rounded).double(), gradient(rounded.double()), rtol=0, atol=20 * EPS32)
+    actual = poses.rotations(rounded).double()
+    expected = matrix(rounded.double())
+    torch.testing.assert_close(actual, expected, rtol=0, atol=4 * EPS32)
+    actual = gradient(rounded).double()
+    expected = gradient(rounded.double())
+    torch.testing.assert_close(actual, expected, rtol=0, atol=20 * EPS32)
 
 
 def test_a_correction_moves_points_in_the_camera_s_frame():
@@ -78,7 +83,8 @@ def test_a_correction_moves_points_in_the_camera_s_frame():
     before = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     after = points @ found[:, :3, :3].mT + found[:, None, :3, 3]
     turned = torch.stack([matrix(row[:3]) for row in corrections])
-    torch.testing.assert_close(after, before @ turned.mT + corrections[:, None, 3:], rtol=0, atol=1e-13)
+    expected = before @ turned.mT + corrections[:, None, 3:]
+    torch.testing.assert_close(after, expected, rtol=0, atol=1e-13)
     assert torch.equal(poses.corrected(viewmats, torch.zeros(4, 6, dtype=torch.float64)), viewmats)
 
 
@@ -106,7 +112,8 @@ def test_image_motion_is_the_mean_square_of_how_far_pixels_move():
     for column in range(6):
         row = torch.zeros(5, 6, dtype=torch.float64)
         row[:, column] = one_pixel[:, column]
-        torch.testing.assert_close((row[:, None] @ motion @ row[..., None]).flatten(), torch.ones(5).double())
+        actual = (row[:, None] @ motion @ row[..., None]).flatten()
+        torch.testing.assert_close(actual, torch.ones(5).double())
 
 
 def test_depths_of_views_are_quartiles_of_the_points_in_their_images():
@@ -117,7 +124,8 @@ def test_depths_of_views_are_quartiles_of_the_points_in_their_images():
     beside = torch.tensor([[50.0, 0.0, 9.0], [0.0, 0.0, 1e-9]], dtype=torch.float64)
     sizes = torch.tensor([SIZE], dtype=torch.float64).expand(3, 2)
     found = poses.view_depths(viewmats, intrinsics(3), sizes, torch.cat([before, beside]))
-    torch.testing.assert_close(found, torch.tensor([[2.0, 3.0, 4.0]]).double().expand(3, 3))
+    expected = torch.tensor([[2.0, 3.0, 4.0]]).double().expand(3, 3)
+    torch.testing.assert_close(found, expected)
     nothing = poses.view_depths(viewmats, intrinsics(3), sizes, before[:0])
     assert torch.equal(nothing, torch.ones_like(nothing))
 
@@ -144,7 +152,8 @@ def test_a_common_motion_of_all_cameras_is_taken_out_to_rounding(dtype: torch.dt
     size = {torch.float32: 1e-5, torch.float64: 1e-8}[dtype]
     direction = random(7, seed=7)
     common = moved_together(viewmats, size * direction[:3], size * direction[3:6], size * float(direction[6]))
-    torch.testing.assert_close(gauge.common_motion(common.to(dtype)).double(), size * direction, rtol=1e-4, atol=0)
+    actual = gauge.common_motion(common.to(dtype)).double()
+    torch.testing.assert_close(actual, size * direction, rtol=1e-4, atol=0)
     table = common.to(dtype)
     gauge.take_out(table)
     # The square of the motion is below the rounding of corrections of a thousandth.

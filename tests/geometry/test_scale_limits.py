@@ -16,7 +16,8 @@ def test_points_are_clear_of_cameras_from_their_radius_on():
     means = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     positions = torch.tensor([[0.0, 0, 2], [9, 0, 0]])
     radii = torch.tensor([2.0, 2.5, 3.0])
-    assert (camera_distances(means, positions, radii) >= radii).tolist() == [True, False, True]
+    actual = (camera_distances(means, positions, radii) >= radii).tolist()
+    assert actual == [True, False, True]
 
 
 @pytest.mark.hard_case("cameras and points far from the origin", "distances to cameras are exact")
@@ -43,7 +44,8 @@ def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: floa
         monkeypatch.setattr(scale_limits, "_PAIRS", pairs)
         limited = torch.nn.Parameter(scales.clone())
         limit_scales(limited, means, positions, 0.5)
-        torch.testing.assert_close(limited.detach().double(), expected, rtol=0, atol=1e-5)
+        actual = limited.detach().double()
+        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-5)
         assert torch.equal(limited.detach()[expected == scales], scales[expected == scales])
 
 
@@ -57,8 +59,10 @@ def test_many_cameras_limit_the_same_axes_to_the_same_length(
     positions = torch.rand((number, 3), generator=generator).cumsum(dim=0) + offset
     means = positions[torch.arange(600) % number] + 5 * torch.randn((600, 3), generator=generator)
     scales = 2 * torch.randn((600, 3), generator=generator) - 1
-    scales[0], scales[1] = torch.inf, torch.nan
-    each, many = scales.clone(), scales.clone()
+    scales[0] = torch.inf
+    scales[1] = torch.nan
+    each = scales.clone()
+    many = scales.clone()
     limit_scales(each, means, positions, 0.5)
     distances = camera_distances(means, positions, scales.amax(dim=1).exp())
     monkeypatch.setattr(scale_limits, "MANY_CAMERAS", 10)
@@ -68,13 +72,15 @@ def test_many_cameras_limit_the_same_axes_to_the_same_length(
     radii = torch.rand(600, generator=generator) * 8
     found = camera_distances(means, positions, radii)
     assert torch.equal(found >= radii, distances >= radii)
-    assert 100 < int(found.isfinite().sum()) < 500 and torch.equal(found[found.isfinite()], distances[found.isfinite()])
+    assert 100 < int(found.isfinite().sum()) < 500
+    assert torch.equal(found[found.isfinite()], distances[found.isfinite()])
 
 
 def test_a_gaussian_around_a_camera_keeps_a_finite_size():
     scales = torch.zeros((1, 3))
     limit_scales(scales, torch.ones((1, 3)), torch.ones((1, 3)), 0.5)
-    assert scales.isfinite().all() and (scales < -10).all()
+    assert scales.isfinite().all()
+    assert (scales < -10).all()
 
 
 @pytest.mark.hard_case(
@@ -85,7 +91,8 @@ def test_a_gaussian_around_a_camera_keeps_a_finite_size():
 def test_a_giant_beside_the_view_covers_all_of_it_until_it_is_limited():
     # As on a capture of 30 photos: the camera looks along z, and the giant lies 30 units to its side, nearly in the
     # plane of its lens, with an axis that is ten times as long. Training views saw a little of its tail.
-    means, quats = torch.tensor([[30.0, 0.0, 0.85]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+    means = torch.tensor([[30.0, 0.0, 0.85]])
+    quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]])
     scales = torch.tensor([[324.0, 26.0, 1.6]]).log()
     K = torch.tensor([[[40.0, 0.0, 20.0], [0.0, 40.0, 15.0], [0.0, 0.0, 1.0]]])
 

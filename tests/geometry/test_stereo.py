@@ -12,7 +12,8 @@ from sadgs_ns.geometry import stereo
 from sadgs_ns.geometry.stereo import DepthMap, depth_maps
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 PLANES = {  # Normals n and offsets d of planes n · X = d. The nearest plane is seen.
     "frontal": [([0.0, 0.0, 1.0], 10.0)],
     "slanted": [([0.5, 0.2, 1.0], 10.0)],
@@ -40,13 +41,18 @@ def texture(points: Tensor) -> Tensor:
 
 def capture(planes: str = "slanted", count: int = 5, sizes: list[tuple[int, int]] | None = None) -> Capture:
     """Images of a row of cameras that turn a little, their viewmats and Ks, and points on the planes."""
-    viewmats, Ks, images, points = [], [], [], []
+    viewmats = []
+    Ks = []
+    images = []
+    points = []
     for v, (width, height) in enumerate(sizes or [(WIDTH, HEIGHT)] * count):
         offset = v - (count - 1) / 2
-        cosine, sine = math.cos(0.02 * offset), math.sin(0.02 * offset)
+        cosine = math.cos(0.02 * offset)
+        sine = math.sin(0.02 * offset)
         rotation = torch.tensor([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]).double()
         viewmat = torch.eye(4).double()
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ torch.tensor([offset, 0.2 * (v % 2), 0]).double()
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ torch.tensor([offset, 0.2 * (v % 2), 0]).double()
         K = torch.tensor([[150, 0, 0.48 * width], [0, 140, 0.53 * height], [0, 0, 1]]).double()
         seen, _ = trace(planes, viewmat, K, height, width)
         images.append(texture(seen).float()[..., None].expand(-1, -1, 3))
@@ -64,8 +70,10 @@ def check(maps: list[DepthMap], planes: str, viewmats: Tensor, share: float = 0.
         known = depth_map.confidence > 0
         errors = (depth_map.depth / depth - 1)[known]
         assert (errors.abs() < 0.01).double().mean() > 0.95
-        assert errors.abs().median() < 0.002 and errors.median().abs() < 0.0006
-        assert torch.equal(known, depth_map.depth > 0) and 0.9 < depth_map.confidence.max() <= 1
+        assert errors.abs().median() < 0.002
+        assert errors.median().abs() < 0.0006
+        assert torch.equal(known, depth_map.depth > 0)
+        assert 0.9 < depth_map.confidence.max() <= 1
         confident.append(known.double().mean())
     assert torch.stack(confident).mean() > share
 
@@ -113,21 +121,24 @@ def test_masked_pixels_have_no_depth_and_are_no_evidence():
     marked = [torch.where(mask[..., None], image, images[0]) for image in images]
     maps = depth_maps(marked.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu")
     check(maps, "slanted", viewmats, 0.6)
-    assert not any(depth_map.confidence[~mask].any() or depth_map.depth[~mask].any() for depth_map in maps)
+    for depth_map in maps:
+        assert not (depth_map.confidence[~mask].any() or depth_map.depth[~mask].any())
     broken = [torch.where(mask[..., None], image, torch.nan) for image in images]
     transparent = [torch.cat([image, mask[..., None]], dim=2) for image in images]
     for same in (
         depth_maps(broken.__getitem__, viewmats, Ks, points, masks=[mask] * 5, device="cpu"),
         depth_maps(transparent.__getitem__, viewmats, Ks, points, device="cpu"),
     ):
-        assert all(torch.equal(a.depth, b.depth) for a, b in zip(maps, same, strict=True))
+        for a, b in zip(maps, same, strict=True):
+            assert torch.equal(a.depth, b.depth)
 
 
 def test_repeated_calls_give_the_same():
     images, *cameras = capture("ridge", 2)
     first, second = (depth_maps(images.__getitem__, *cameras, device="cpu") for _ in range(2))
     for a, b in zip(first, second, strict=True):
-        assert torch.equal(a.depth, b.depth) and torch.equal(a.confidence, b.confidence)
+        assert torch.equal(a.depth, b.depth)
+        assert torch.equal(a.confidence, b.confidence)
         assert (a.confidence > 0).double().mean() > 0.3
 
 
@@ -140,13 +151,15 @@ def test_nothing_is_known_without_texture_neighbours_or_points():
     ):
         for depth_map in empty:
             assert depth_map.depth.shape == depth_map.confidence.shape == (HEIGHT, WIDTH)
-            assert not depth_map.depth.any() and not depth_map.confidence.any()
+            assert not depth_map.depth.any()
+            assert not depth_map.confidence.any()
 
 
 def test_neighbours_see_the_same_points_from_good_angles():
     y, x = torch.meshgrid(torch.linspace(-20, 20, 40), torch.linspace(-30, 30, 60), indexing="ij")
     points = torch.stack([x, y, torch.full_like(x, 10)], dim=2).flatten(0, 1)[::2].double()
-    Ks, sizes = capture(count=1)[2].expand(9, 3, 3), torch.tensor([[WIDTH, HEIGHT]]).expand(9, 2)
+    Ks = capture(count=1)[2].expand(9, 3, 3)
+    sizes = torch.tensor([[WIDTH, HEIGHT]]).expand(9, 2)
     viewmats = torch.eye(4).double().repeat(9, 1, 1)
     for spacing, expected in ((1.2, [2, 3, 5, 6]), (0.3, [0, 1, 7, 8])):
         viewmats[:, 0, 3] = -spacing * torch.arange(9)
@@ -155,7 +168,9 @@ def test_neighbours_see_the_same_points_from_good_angles():
         assert chosen[4, :2].sum() == 8, "the first two should lie on either side"
     viewmats[8, :3, :3] = torch.diag(torch.tensor([-1.0, 1.0, -1.0]))  # It looks away.
     chosen = choose_neighbours(viewmats, Ks, sizes, points, 10)
-    assert (chosen[8] == -1).all() and not (chosen == 8).any() and (chosen[:, 7:] == -1).all()
+    assert (chosen[8] == -1).all()
+    assert not (chosen == 8).any()
+    assert (chosen[:, 7:] == -1).all()
 
 
 @pytest.mark.parametrize("level", range(stereo.LEVELS))
@@ -177,8 +192,10 @@ def test_correlations_are_those_of_plain_loops(level: int):
                 ray = K.inverse() @ torch.tensor([j + 0.5, i + 0.5, 1.0]).double()
                 world = viewmats[0].inverse() @ torch.cat([ray / inverse[i, j], torch.ones(1)])
                 u, v, z = (K @ (viewmats[1] @ world)[:3]).tolist()
-                u, v = u / z - 0.5, v / z - 0.5
-                left, top = math.floor(u), math.floor(v)
+                u = u / z - 0.5
+                v = v / z - 0.5
+                left = math.floor(u)
+                top = math.floor(v)
                 corners = other[:, max(top, 0) : top + 2, max(left, 0) : left + 2].double()
                 if image[1, i, j] and corners.shape == (2, 2, 2) and corners[1].all():
                     weights = torch.tensor([[1 - v + top], [v - top]]) * torch.tensor([[1 - u + left, u - left]])

@@ -25,7 +25,8 @@ class Page:
     """One tab."""
 
     def __init__(self, socket: ClientConnection) -> None:
-        self._socket, self._ids = socket, itertools.count(1)
+        self._socket = socket
+        self._ids = itertools.count(1)
 
     def command(self, method: str, **params: Any) -> dict[str, Any]:
         """Send a command and return its result; events in between are dropped."""
@@ -45,7 +46,8 @@ class Page:
         """The value of an expression as soon as it is true."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            if value := self.run(script):
+            value = self.run(script)
+            if value:
                 return value
             time.sleep(0.5)
         raise TimeoutError(f"never true: {script}")
@@ -92,9 +94,11 @@ def open_page(url: str, profile: Path, width: int = 1280, height: int = 800) -> 
         stderr=subprocess.DEVNULL,
     )
     try:
-        port_file, end = profile / "DevToolsActivePort", time.monotonic() + HANGS
+        port_file = profile / "DevToolsActivePort"
+        end = time.monotonic() + HANGS
         while not port_file.exists() or not port_file.read_text():
-            assert process.poll() is None and time.monotonic() < end, "Chromium did not start"
+            assert process.poll() is None, "Chromium did not start"
+            assert time.monotonic() < end, "Chromium did not start"
             time.sleep(0.2)
         port = port_file.read_text().split()[0]
         pages: list[dict[str, Any]] = []

@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from PIL import Image, ImageCms
 
-VIEWS, WIDTH, HEIGHT = 10, 160, 120
+VIEWS = 10
+WIDTH = 160
+HEIGHT = 120
 WALLS = np.array(  # corners of the floor and two walls of a room, in the order of their textures' corners [3, 4, 3]
     [
         [(0, 0, 0), (3, 0, 0), (3, 3, 0), (0, 3, 0)],
@@ -28,7 +30,8 @@ def camera_centres() -> np.ndarray:
 
 def walk_centres() -> np.ndarray:
     """Where photos are taken on a walk into the corner of the room, swaying a little. [VIEWS, 3]"""
-    ahead, sway = np.linspace(3.0, 2.2, VIEWS)[:, None], 0.02 * np.sin(2 * np.arange(VIEWS))[:, None]
+    ahead = np.linspace(3.0, 2.2, VIEWS)[:, None]
+    sway = 0.02 * np.sin(2 * np.arange(VIEWS))[:, None]
     return 0.8 + ahead * np.array([0.69, 0.66, 0.3]) + sway * np.array([-0.7, 0.7, 0.2])
 
 
@@ -37,7 +40,8 @@ def draw_photos(centres: np.ndarray | None = None, focal_length: float = WIDTH) 
 
     They are taken from `camera_centres`, or from others [N, 3], with a focal length in px.
     """
-    random, side = np.random.default_rng(0), 256
+    random = np.random.default_rng(0)
+    side = 256
     noise = [cv2.GaussianBlur(random.integers(0, 256, (side, side, 3), np.uint8), (0, 0), 2) for _ in WALLS]
     textures = [np.clip((texture - 127.0) * 5 + 127, 0, 255).astype(np.uint8) for texture in noise]
     corners = np.array([(0, 0), (side, 0), (side, side), (0, side)], np.float32)
@@ -69,7 +73,8 @@ def panorama_centres(count: int) -> np.ndarray:
 @functools.cache
 def hall_textures() -> list[np.ndarray]:
     """Noise of a texel of 1 cm for the two walls across each axis: dark and bright spots of 10 cm, and finer ones."""
-    random, textures = np.random.default_rng(1), []
+    random = np.random.default_rng(1)
+    textures = []
     for axis in (0, 0, 1, 1, 2, 2):
         across, up = np.delete(HALL, axis) * 100
         texture = np.full((int(up), int(across), 3), 127.0)
@@ -109,7 +114,8 @@ def draw_photo(centre: np.ndarray, rotation: np.ndarray, side: int, yaw: float =
     across = (np.arange(side) + 0.5) / side * 2 - 1
     rays = np.stack([*np.meshgrid(across, across), np.ones((side, side))], -1)
     x, down, ahead = np.moveaxis(rays @ rotation.T, -1, 0)
-    cosine, sine = np.cos(yaw), np.sin(yaw)
+    cosine = np.cos(yaw)
+    sine = np.sin(yaw)
     return draw_hall(centre, np.stack([cosine * x + sine * ahead, cosine * ahead - sine * x, -down], -1))
 
 

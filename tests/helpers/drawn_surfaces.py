@@ -23,7 +23,8 @@ def depth_view(surfaces: Sequence[Surface], view: View) -> DepthView:
         colors[index == i] = surface.colour(points[index == i])
     K = np.array([[view.focal, 0, view.width / 2], [0, view.focal, view.height / 2], [0, 0, 1]])
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = view.rotation, view.translation
+    viewmat[:3, :3] = view.rotation
+    viewmat[:3, 3] = view.translation
     size = view.height, view.width
     depth = np.where(np.isfinite(depth), depth, 0).reshape(size).astype(np.float32)
     return DepthView(depth, colors.reshape(*size, 3).astype(np.float32), K, viewmat)

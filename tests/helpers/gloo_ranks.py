@@ -39,7 +39,8 @@ def run_ranks(
     try:
         for process in processes:
             process.join(max(end - time.monotonic(), 0))
-        assert [process.exitcode for process in processes] == [-9 if r in doomed else 0 for r in range(number)]
+        expected = [-9 if r in doomed else 0 for r in range(number)]
+        assert [process.exitcode for process in processes] == expected
     finally:
         for process in processes:
             process.kill()

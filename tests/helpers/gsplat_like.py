@@ -34,7 +34,9 @@ def rasterization(
 
     The torch backend has tiles of `tile_size` px, and radii as gsplat 1.5 has them, as 1.4, or as the installed one.
     """
-    assert not packed and render_mode in ("RGB", "RGB+ED") and rasterize_mode == "classic"
+    assert not packed
+    assert render_mode in ("RGB", "RGB+ED")
+    assert rasterize_mode == "classic"
     gaussians = Gaussians(means, quats, scales, opacities, colors)
     layout = backend_torch.RADII_PER_AXIS if per_axis_radii is None else per_axis_radii
     with patch.object(backend_torch, "RADII_PER_AXIS", layout), patch.object(backend_torch, "TILE_SIZE", tile_size):

@@ -39,7 +39,8 @@ def stub_gsplat(monkeypatch: pytest.MonkeyPatch, per_axis_radii: bool) -> None:
     def isect_tiles(
         means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int
     ) -> tuple[Tensor, Any, Tensor]:
-        assert tile_size == backend_torch.TILE_SIZE and radii.dtype == torch.int32
+        assert tile_size == backend_torch.TILE_SIZE
+        assert radii.dtype == torch.int32
         extents = (radii if per_axis_radii else radii[..., None].expand_as(means2d)).to(means2d.dtype)
         tiles = backend_torch._bin_into_tiles(
             means2d, depths, extents, tile_width * tile_size, tile_height * tile_size
@@ -80,10 +81,13 @@ def rasterize_to_pixels(
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
     """gsplat's: a list ends where the next begins, and the last at the end."""
-    views, size = len(starts), tile_size
-    rows, columns = -(-height // size), -(-width // size)
+    views = len(starts)
+    size = tile_size
+    rows = -(-height // size)
+    columns = -(-width // size)
     ends = torch.cat([starts.flatten()[1:], torch.tensor([len(ids)])]).view_as(starts)
-    starts, ends = (places[:, :rows].flatten().long() for places in (starts, ends))
+    starts = starts[:, :rows].flatten().long()
+    ends = ends[:, :rows].flatten().long()
     row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     origins = (torch.stack([column, row], dim=-1) * size).reshape(-1, 2).repeat(views, 1)
     tiles = backend_torch._Tiles(size, origins, starts, ends - starts, ids.long())

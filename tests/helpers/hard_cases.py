@@ -66,7 +66,8 @@ def cell(text: str) -> str:
 
 def page(folder: Path = TESTS) -> str:
     """The page in Markdown: a section for each folder and test file, which its docstring introduces."""
-    parts, last = [HEAD], ""
+    parts = [HEAD]
+    last = ""
     for file, module, cases in modules(folder):
         section = Path(file).parent.name or "all"
         if section != last:

@@ -70,12 +70,18 @@ def parser_of(scene: Path) -> ColmapDataParserConfig:
 def configure(scene: Path, output: Path, iterations: int, save_every: int, seed: int = 42) -> SadgsTrainerConfig:
     """The demo's settings, with checkpoints on the way and all attempts in one folder."""
     config: SadgsTrainerConfig = copy.deepcopy(sadgs.config)  # type: ignore[assignment]
-    config.output_dir, config.experiment_name, config.timestamp = output, "test", "run"
+    config.output_dir = output
+    config.experiment_name = "test"
+    config.timestamp = "run"
     config.vis = "tensorboard"
-    config.machine.device_type, config.machine.seed = "cpu", seed
-    config.max_num_iterations, config.steps_per_save = iterations, save_every
-    config.steps_per_eval_image, config.share_always = 0, True
-    config.logging.local_writer.enable, config.logging.profiler = False, "none"
+    config.machine.device_type = "cpu"
+    config.machine.seed = seed
+    config.max_num_iterations = iterations
+    config.steps_per_save = save_every
+    config.steps_per_eval_image = 0
+    config.share_always = True
+    config.logging.local_writer.enable = False
+    config.logging.profiler = "none"
     config.pipeline.datamanager.dataparser = parser_of(scene)
     config.pipeline.model.strategy = dataclasses.replace(config.pipeline.model.strategy)
     fit_densification(config.pipeline.model.strategy, max_gaussians=2000)
@@ -222,7 +228,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         shutil.rmtree(given.folder / name, ignore_errors=True)
         return configure(scene, given.folder / name, given.iterations, given.save_every, seed)
 
-    undisturbed, disturbed = configured("undisturbed"), configured("disturbed")
+    undisturbed = configured("undisturbed")
+    disturbed = configured("disturbed")
     for config in (undisturbed, configured("other seed", 43)):
         assert run(config) == 0
     structure_every = disturbed.pipeline.model.strategy.windows.structure_every

@@ -10,7 +10,9 @@ from torch import Tensor
 from helpers.small_scenes import random_params
 from sadgs_ns.render.types import Cameras, Gaussians
 
-WIDTH, HEIGHT, GAUSSIANS = 64, 75, 200
+WIDTH = 64
+HEIGHT = 75
+GAUSSIANS = 200
 
 
 def cameras(views: int) -> tuple[Tensor, Tensor]:

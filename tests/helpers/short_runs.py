@@ -47,7 +47,9 @@ SCHEDULE = {
 def configure(output: Path, parser: DataParserConfig, iterations: int = 6, **strategy: Any) -> SadgsTrainerConfig:
     """The preset on other data, with the tests' schedule, without viewer and evaluation."""
     config: SadgsTrainerConfig = copy.deepcopy(sadgs.config)  # type: ignore[assignment]
-    config.output_dir, config.experiment_name, config.timestamp = output, "test", "run"
+    config.output_dir = output
+    config.experiment_name = "test"
+    config.timestamp = "run"
     config.vis = "tensorboard"
     config.max_num_iterations = iterations
     config.steps_per_save = config.steps_per_eval_image = 0

@@ -11,7 +11,10 @@ from helpers.gsplat_like import splatted
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-WIDTH, HEIGHT, VIEWS, POINTS = 48, 36, 10, 300
+WIDTH = 48
+HEIGHT = 36
+VIEWS = 10
+POINTS = 300
 """Of the drawn scene that the fixture `scene` is."""
 ITERATIONS = 12
 """Of the run on it that the fixture `config` describes."""

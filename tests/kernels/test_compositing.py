@@ -39,10 +39,12 @@ def make_scene(
 
     size = torch.tensor([width, height])
     means2d = random(2) * size * 1.4 - size * 0.2
-    angles, sigmas = 3.2 * random(), 0.6 + 3 * random(2)
+    angles = 3.2 * random()
+    sigmas = 0.6 + 3 * random(2)
     opacities = 0.05 + 0.85 * random()
     if kind == "opaque":
-        opacities, sigmas = 0.95 + 0.05 * random(), 2 * sigmas + 2
+        opacities = 0.95 + 0.05 * random()
+        sigmas = 2 * sigmas + 2
         opacities[:, ::3] = 1.0  # alpha is cut off at 0.999 around the centre
     elif kind == "faint":
         opacities = 0.012 * random()  # mostly below 1/255
@@ -142,7 +144,8 @@ def test_gradients_equal_float64_autograd(kind):
     scene = make_scene(kind, num_views=2 if kind == "usual" else 1)
     expected, alphas, last_ids = reference(scene)
     if kind == "opaque":  # most lists end behind what is drawn
-        assert (alphas > 0.999).float().mean() > 0.3 and last_ids.max() < len(scene["ids"]) - 5
+        assert (alphas > 0.999).float().mean() > 0.3
+        assert last_ids.max() < len(scene["ids"]) - 5
     gradients = gradients_of(scene, alphas, last_ids)
     for name, value in expected.items():
         assert value.abs().max() > 0
@@ -165,8 +168,11 @@ def test_what_is_drawn_equals_the_plain_formula_in_float64(kind):
     agrees = last == last_ids
     assert agrees.float().mean() > 0.98
     tolerance = 2e-5 if kind in ("long and thin", "huge") else 2e-6
-    torch.testing.assert_close(renders[agrees].double(), scene["renders"][agrees], atol=tolerance, rtol=0)
-    torch.testing.assert_close(found[agrees].double(), alphas[agrees], atol=tolerance, rtol=0)
+    actual = renders[agrees].double()
+    expected = scene["renders"][agrees]
+    torch.testing.assert_close(actual, expected, atol=tolerance, rtol=0)
+    actual = found[agrees].double()
+    torch.testing.assert_close(actual, alphas[agrees], atol=tolerance, rtol=0)
     torch.testing.assert_close(found.double(), alphas, atol=1 / 255 + tolerance, rtol=0)
 
 
@@ -180,8 +186,10 @@ def test_a_colour_that_is_not_finite_makes_the_pixels_nan_that_see_it_and_no_oth
     scene["colors"][0, [7, 9]] = 1.0
     sees = drawn_by_the_kernel(scene)[0][..., 0] > 0
     assert 5 < sees.sum() < sees.numel() - 5
-    assert after[0][sees].isnan().all() and torch.equal(after[0][~sees], before[0][~sees])
-    assert torch.equal(after[1], before[1]) and torch.equal(after[2], before[2])
+    assert after[0][sees].isnan().all()
+    assert torch.equal(after[0][~sees], before[0][~sees])
+    assert torch.equal(after[1], before[1])
+    assert torch.equal(after[2], before[2])
 
 
 def test_places_below_the_image_are_not_drawn_and_nothing_in_sight_is_black():
@@ -192,9 +200,11 @@ def test_places_below_the_image_are_not_drawn_and_nothing_in_sight_is_black():
     for one, other in zip(expected, drawn_by_the_kernel(scene), strict=True):
         assert torch.equal(one, other)
     scene["starts"], scene["ids"], _ = scene["pending"].lists(needed - 1)
-    assert all(not value.any() for value in drawn_by_the_kernel(scene))
+    for value in drawn_by_the_kernel(scene):
+        assert not value.any()
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
-    assert all(not value.any() for value in drawn_by_the_kernel(scene))
+    for value in drawn_by_the_kernel(scene):
+        assert not value.any()
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.1, 0.2, 0.55])
@@ -212,9 +222,11 @@ def test_without_absgrad_the_rest_is_the_same():
     scene = make_scene("usual", n=30, width=9, height=9)
     _, alphas, last_ids = reference(scene)
     both = [gradients_of(scene, alphas, last_ids, absgrad) for absgrad in (True, False)]
-    assert both[0].pop("absgrad") is not None and both[1].pop("absgrad") is None
+    assert both[0].pop("absgrad") is not None
+    assert both[1].pop("absgrad") is None
     for name, value in both[0].items():
-        torch.testing.assert_close(both[1][name], value, atol=1e-6, rtol=1e-5)
+        actual = both[1][name]
+        torch.testing.assert_close(actual, value, atol=1e-6, rtol=1e-5)
 
 
 def test_without_a_gradient_of_alphas_it_counts_as_zero():
@@ -249,14 +261,17 @@ def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken)
     assert 5 < seen.sum() < 55
     for name in NAMES[:4]:
         assert gradients[name][0, seen].isnan().all(), name
-        torch.testing.assert_close(gradients[name][0, ~seen], expected[name][0, ~seen], atol=1e-6, rtol=1e-5)
+        actual = gradients[name][0, ~seen]
+        torch.testing.assert_close(actual, expected[name][0, ~seen], atol=1e-6, rtol=1e-5)
 
 
 def test_nothing_in_sight_has_gradients_of_zero():
     scene = make_scene("usual", n=3)
     scene["starts"], scene["ids"] = torch.zeros_like(scene["starts"]), scene["ids"][:0]
-    alphas, last_ids = torch.zeros(1, 18, 21, 1), torch.zeros(1, 18, 21, dtype=torch.int32)
-    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+    alphas = torch.zeros(1, 18, 21, 1)
+    last_ids = torch.zeros(1, 18, 21, dtype=torch.int32)
+    for value in gradients_of(scene, alphas, last_ids).values():
+        assert (value == 0).all()
 
 
 @pytest.mark.parametrize(("num_views", "width", "height"), [(2, 21, 18), (1, 16, 16)])
@@ -266,7 +281,8 @@ def test_places_that_no_list_needs_change_nothing(num_views, width, height):
     expected = gradients_of(scene, alphas, last_ids)
     scene["starts"], scene["ids"], _ = scene["pending"].lists(len(scene["ids"]) + 300)
     _, alphas_again, last_ids_again = reference(scene)
-    assert torch.equal(alphas_again, alphas) and torch.equal(last_ids_again, last_ids)
+    assert torch.equal(alphas_again, alphas)
+    assert torch.equal(last_ids_again, last_ids)
     gradients = gradients_of(scene, alphas, last_ids)
     for name, value in expected.items():
         if DEVICE.type == "cpu":
@@ -278,8 +294,10 @@ def test_places_that_no_list_needs_change_nothing(num_views, width, height):
 def test_lists_that_are_too_short_have_gradients_of_zero():
     scene = make_scene("usual", 2, 30)
     scene["starts"], scene["ids"], _ = scene["pending"].lists(len(scene["ids"]) - 1)
-    alphas, last_ids = torch.zeros(2, 18, 21, 1), torch.zeros(2, 18, 21, dtype=torch.int32)
-    assert all((value == 0).all() for value in gradients_of(scene, alphas, last_ids).values())
+    alphas = torch.zeros(2, 18, 21, 1)
+    last_ids = torch.zeros(2, 18, 21, dtype=torch.int32)
+    for value in gradients_of(scene, alphas, last_ids).values():
+        assert (value == 0).all()
 
 
 def test_tiles_without_gaussians_stay_out_of_the_others_lists():
@@ -319,7 +337,8 @@ def test_autograd_gets_what_the_kernel_returns(through):
         if name in ("conics", "opacities"):
             assert found is None
         else:
-            torch.testing.assert_close(found.double().cpu(), value, atol=5e-4 * float(value.abs().max()), rtol=0)
+            actual = found.double().cpu()
+            torch.testing.assert_close(actual, value, atol=5e-4 * float(value.abs().max()), rtol=0)
 
 
 @pytest.mark.skipif(
@@ -328,7 +347,8 @@ def test_autograd_gets_what_the_kernel_returns(through):
 @pytest.mark.parametrize(("max_off_axis", "capacity"), [(0.0, None), (0.5, None), (0.0, 3000)])
 def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatch, max_off_axis, capacity):
     """All of it for two views; torch code stands in for gsplat's projection."""
-    width, height = 22, 18
+    width = 22
+    height = 18
 
     def project(means, quats, scales, opacities, viewmats, Ks, width, height, near_plane):
         covariances = _quat_scale_to_covar_preci(quats, scales, True, False)[0]
@@ -342,8 +362,10 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
     viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
     viewmats[1, :3, 3] = torch.tensor([0.2, 0.1, 0.3])
     Ks = small_scenes.camera(width, height, 30.0)[1].repeat(2, 1, 1)
-    rest, v_renders = (0.1 * torch.randn(shape, generator=generator) for shape in ((60, 15, 3), (2, height, width, 3)))
-    results, drawn = [], []
+    rest = 0.1 * torch.randn((60, 15, 3), generator=generator)
+    v_renders = 0.1 * torch.randn((2, height, width, 3), generator=generator)
+    results = []
+    drawn = []
     for backend, dtype in (("triton", torch.float32), ("torch", torch.float64)):
         values = {name: p.detach() for name, p in small_scenes.random_params(60).items()} | {"rest": rest}
         values = {name: value.to(dtype, copy=True).requires_grad_() for name, value in values.items()}
@@ -367,7 +389,8 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         results.append({name: value.grad for name, value in values.items()} | {"absgrad": info["means2d"].absgrad})
         results[-1]["renders"] = renders.detach()
         results[-1]["summed gradient"] = sums["grad2d"]
-    assert drawn[0] == drawn[1] and (drawn[0] < 70) is (max_off_axis > 0)
+    assert drawn[0] == drawn[1]
+    assert (drawn[0] < 70) is (max_off_axis > 0)
     for name, expected in results[1].items():
         error = (results[0][name].double() - expected).norm() / expected.norm()
         assert error < (1e-4 if name == "absgrad" else 5e-6), (name, float(error))
@@ -385,7 +408,8 @@ def test_what_is_drawn_is_as_close_to_float64_as_what_gsplat_draws(kind):
     )  # fmt: skip
     truths = (scene["renders"], true_alphas)
     for ours, gsplats, true in zip(drawn_by_the_kernel(scene)[:2], expected, truths, strict=True):
-        error, gsplats_error = (ours.cpu() - true).abs(), (gsplats.cpu() - true).abs()
+        error = (ours.cpu() - true).abs()
+        gsplats_error = (gsplats.cpu() - true).abs()
         assert error.mean() <= 1.2 * gsplats_error.mean() + 1e-6, (float(error.mean()), float(gsplats_error.mean()))
         assert (error > 1e-5).float().mean() <= 1.2 * (gsplats_error > 1e-5).float().mean() + 1e-3
         assert error.max() <= 2 * gsplats_error.max() + 0.005
@@ -414,7 +438,11 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         gradients: dict[str, Any] = dict(
             zip(NAMES, [*(value.grad for value in inputs), means2d.absgrad], strict=True)
         )  # fmt: skip
-        errors.append({k: float((gradients[k].double().cpu() - v).norm() / v.norm()) for k, v in expected.items()})
+        of_run = {}
+        for name, value in expected.items():
+            difference = gradients[name].double().cpu() - value
+            of_run[name] = float(difference.norm() / value.norm())
+        errors.append(of_run)
     print(kind, *errors)
     stated = {"absgrad": 1e-4}
     if kind == "tiny":

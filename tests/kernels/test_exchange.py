@@ -28,7 +28,8 @@ def test_rows_are_torchs_and_give_the_gaussians_back(per_axis_radii: bool, numbe
     for top in (0, 48):
         taken = kernels.unpack(rows, top)
         for name, value, expected in zip(Projected._fields[:6], taken, exchange.unpack(rows, top), strict=True):
-            assert value.is_contiguous() and value.dtype == expected.dtype, name
+            assert value.is_contiguous(), name
+            assert value.dtype == expected.dtype, name
             torch.testing.assert_close(value, expected, rtol=0, atol=0)
     taken = kernels.unpack(rows, 0)
     for value, whole in zip(taken, projected, strict=True):
@@ -41,10 +42,13 @@ def test_rows_of_gradients_are_taken_as_they_lie_or_put_together():
     columns = [parts[0], parts[1], parts[2][..., 0], parts[3], parts[4], None]
     widths = exchange._GRADIENTS
     taken = exchange._gradient_rows(columns, widths, 4, like=rows)
-    assert taken.data_ptr() == rows.data_ptr() and torch.equal(taken, rows[0, :4])
+    assert taken.data_ptr() == rows.data_ptr()
+    assert torch.equal(taken, rows[0, :4])
     for changed in ([columns[0].clone(), *columns[1:]], [*columns[:3], columns[3].clone(), *columns[4:]]):
         copied = exchange._gradient_rows(changed, widths, 4, like=rows)
-        assert copied.data_ptr() != rows.data_ptr() and torch.equal(copied[:, :11], rows[0, :4, :11])
+        assert copied.data_ptr() != rows.data_ptr()
+        assert torch.equal(copied[:, :11], rows[0, :4, :11])
         assert (copied[:, 11] == 0).all()
     without = exchange._gradient_rows([None, *columns[1:]], widths, 4, like=rows)
-    assert (without[:, :2] == 0).all() and torch.equal(without[:, 2:11], rows[0, :4, 2:11])
+    assert (without[:, :2] == 0).all()
+    assert torch.equal(without[:, 2:11], rows[0, :4, 2:11])

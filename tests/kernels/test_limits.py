@@ -40,8 +40,10 @@ def test_the_largest_sizes_pass_and_one_more_is_refused():
 
 
 def render(num_views: int, num_gaussians: int, side: int) -> None:
-    means, viewmats = torch.empty((num_gaussians, 3), device="meta"), torch.empty((num_views, 4, 4), device="meta")
-    gaussians, cameras = Gaussians(means, means, means, means, means), Cameras(viewmats, viewmats, side, side)
+    means = torch.empty((num_gaussians, 3), device="meta")
+    viewmats = torch.empty((num_views, 4, 4), device="meta")
+    gaussians = Gaussians(means, means, means, means, means)
+    cameras = Cameras(viewmats, viewmats, side, side)
     backend_triton.project(gaussians, cameras, RenderOptions())
 
 
@@ -67,19 +69,23 @@ def test_coefficients_beyond_32_bits_are_found_forward_and_backward():
 
     Nothing but these rows is touched, so that the memory between them is never made; bytes need the least of it.
     """
-    stride, n = 2**30, 3
-    means, viewmats = torch.tensor([[0.0, 0.0, 1.0]]).repeat(n, 1).to(DEVICE), torch.eye(4, device=DEVICE)[None]
+    stride = 2**30
+    n = 3
+    means = torch.tensor([[0.0, 0.0, 1.0]]).repeat(n, 1).to(DEVICE)
+    viewmats = torch.eye(4, device=DEVICE)[None]
     rest, v_rest = (torch.empty(2 * stride + 45, dtype=torch.uint8, device=DEVICE) for _ in range(2))
     for g in range(n):
         rest[g * stride : g * stride + 45] = 0
         rest[g * stride + 3 : g * stride + 6] = torch.tensor([g, 2, 3])  # of the harmonic 0.4886 z
-    first, radii = torch.zeros((n, 3), device=DEVICE), torch.ones((1, n), dtype=torch.int32, device=DEVICE)
+    first = torch.zeros((n, 3), device=DEVICE)
+    radii = torch.ones((1, n), dtype=torch.int32, device=DEVICE)
     colors = torch.empty((1, n, 3), device=DEVICE)
     harmonics._forward[1,](means, viewmats, first, rest, radii, colors, n, 1, 3, stride, 1, 32)
     expected = 0.5 + 0.48860251190292 * torch.tensor([[[0.0, 2, 3], [1, 2, 3], [2, 2, 3]]])
     torch.testing.assert_close(colors.cpu(), expected)
     v_colors = torch.tensor([[[10.0, 20, 30], [40, 50, 60], [70, 80, 90]]], device=DEVICE)
-    v_means, v_first = torch.empty_like(means), torch.empty_like(first)
+    v_means = torch.empty_like(means)
+    v_first = torch.empty_like(first)
     harmonics._backward[1,](
         means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_means,
         n, 1, 3, stride, 3, False, 1, 32,

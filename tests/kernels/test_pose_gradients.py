@@ -17,7 +17,8 @@ backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="T
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 N = 300
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 OUTPUTS = ("means2d", "depths", "conics", "colors")
 OPTIONS = RenderOptions(sh_degree=3, near_plane=0.2)
 
@@ -101,7 +102,8 @@ def test_gradients_by_the_cameras_equal_float64_autograd(num_views: int, names: 
     for name in ("viewmats", "means"):
         gradient = fast[name].grad
         reference = exact[name].grad
-        assert gradient is not None and reference is not None
+        assert gradient is not None
+        assert reference is not None
         difference = gradient.double().cpu() - reference
         if name == "viewmats":
             # Torch's backend inverts the matrices, ours transposes: these derivatives agree along rigid motions alone.
@@ -128,9 +130,11 @@ def test_projection_s_gradients_by_each_entry_of_a_matrix_equal_float64_autograd
         differentiate(projected, seen, ("means2d", "conics", "depths"))
     reference = exact["viewmats"].grad
     gradient = fast["viewmats"].grad
-    assert reference is not None and gradient is not None
+    assert reference is not None
+    assert gradient is not None
     assert not gradient[:, 3].any()
-    torch.testing.assert_close(gradient.double().cpu(), reference, rtol=1e-4, atol=2e-5 * float(reference.abs().max()))
+    actual = gradient.double().cpu()
+    torch.testing.assert_close(actual, reference, rtol=1e-4, atol=2e-5 * float(reference.abs().max()))
 
 
 def test_other_gradients_do_not_depend_on_whether_cameras_have_one():
@@ -142,10 +146,13 @@ def test_other_gradients_do_not_depend_on_whether_cameras_have_one():
         differentiate(projected, gsplat_compat.drawn(projected.radii, projected.means2d).cpu(), OUTPUTS)
         results.append(leaves)
     without, having = results
-    assert without["viewmats"].grad is None and having["viewmats"].grad is not None
+    assert without["viewmats"].grad is None
+    assert having["viewmats"].grad is not None
     for name in ("means", "quats", "scales", "first", "rest"):
         assert without[name].grad is not None
-        torch.testing.assert_close(without[name].grad, having[name].grad, rtol=1e-6, atol=1e-6)
+        actual = without[name].grad
+        expected = having[name].grad
+        torch.testing.assert_close(actual, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_not_drawn_moves_no_camera_whatever_its_numbers_are():
@@ -161,9 +168,11 @@ def test_what_is_not_drawn_moves_no_camera_whatever_its_numbers_are():
             projected = project(backend_triton, leaves)
         projected.radii.data[:, :100] = 0
         seen = gsplat_compat.drawn(projected.radii, projected.means2d).cpu()
-        assert seen.any() and not seen[:, :100].any()
+        assert seen.any()
+        assert not seen[:, :100].any()
         with np.errstate(all="ignore"):  # Triton's interpreter computes with numpy.
             differentiate(projected, seen, OUTPUTS)
         gradients.append(leaves["viewmats"].grad)
-    assert gradients[0] is not None and gradients[0].abs().sum() > 0
+    assert gradients[0] is not None
+    assert gradients[0].abs().sum() > 0
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-5, atol=1e-5)

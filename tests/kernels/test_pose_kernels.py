@@ -48,9 +48,12 @@ def test_corrected_matrices_and_gradients_equal_float64(number: int, size: float
     fast = table.float().to(DEVICE).requires_grad_()
     found = kernels.corrected(initial.float().to(DEVICE), fast, ids.to(DEVICE))
     (found * upstream.float().to(DEVICE)).sum().backward()
-    torch.testing.assert_close(found.double().cpu(), expected, rtol=0, atol=2e-6)
-    assert fast.grad is not None and exact.grad is not None
-    torch.testing.assert_close(fast.grad.double().cpu(), exact.grad, rtol=1e-5, atol=2e-5)
+    actual = found.double().cpu()
+    torch.testing.assert_close(actual, expected, rtol=0, atol=2e-6)
+    assert fast.grad is not None
+    assert exact.grad is not None
+    actual = fast.grad.double().cpu()
+    torch.testing.assert_close(actual, exact.grad, rtol=1e-5, atol=2e-5)
     others = torch.ones(50, dtype=torch.bool)
     others[ids] = False
     assert not fast.grad[others.to(DEVICE)].any()
@@ -61,7 +64,9 @@ def test_a_view_that_is_drawn_twice_adds_both_gradients():
     initial = cameras(2).float().to(DEVICE)
     kernels.corrected(initial, table, torch.tensor([2, 2], device=DEVICE)).sum().backward()
     assert table.grad is not None
-    torch.testing.assert_close(table.grad[2, 3:].cpu(), torch.full((3,), 2.0))
+    actual = table.grad[2, 3:].cpu()
+    expected = torch.full((3,), 2.0)
+    torch.testing.assert_close(actual, expected)
 
 
 @pytest.mark.parametrize("rows", [1, 7, 300])
@@ -84,8 +89,10 @@ def test_rows_move_as_in_torch(rows: int):
             fast, gradient.float().to(DEVICE), states[1], moved.to(DEVICE), units.float().to(DEVICE), rate,
             BETAS, LOG_BETAS, EPS, flags[1], MAX_GRADIENT,
         )  # fmt: skip
-        torch.testing.assert_close(fast.double().cpu(), exact, rtol=2e-5, atol=2e-5)
+        actual = fast.double().cpu()
+        torch.testing.assert_close(actual, exact, rtol=2e-5, atol=2e-5)
         assert torch.equal(states[1]["step"].double().cpu(), states[0]["step"])
         assert bool(flags[0].isnan()) == bool(flags[1].isnan()) == (step >= 3)
     for name, moment in states[0].items():
-        torch.testing.assert_close(states[1][name].double().cpu(), moment, rtol=1e-5, atol=1e-7)
+        actual = states[1][name].double().cpu()
+        torch.testing.assert_close(actual, moment, rtol=1e-5, atol=1e-7)

@@ -18,7 +18,8 @@ from sadgs_ns.render import backend_torch
 projection_forward = pytest.importorskip("sadgs_ns.kernels.projection_forward", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-WIDTH, HEIGHT = 400, 300
+WIDTH = 400
+HEIGHT = 300
 N = 300  # More than the Gaussians of two programs
 LAYOUTS = pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 OUTPUTS = ("means2d", "depths", "conics")
@@ -85,15 +86,18 @@ def test_it_projects_as_its_twin_does_in_float64(num_views: int, per_axis_radii:
     scene = random_scene(num_views)
     radii, *found = by_the_kernel(scene, WIDTH, HEIGHT)
     true_radii, *true = by_the_twin(scene, torch.float64, WIDTH, HEIGHT)
-    assert radii.dtype == torch.int32 and radii.shape == true_radii.shape
+    assert radii.dtype == torch.int32
+    assert radii.shape == true_radii.shape
     assert radii.shape == ((num_views, N, 2) if per_axis_radii else (num_views, N))
     seen = gsplat_compat.drawn(true_radii, true[0])
     assert 0.2 < seen.float().mean() < 0.8
     # Rounding may move a radius over a whole number.
-    assert (radii - true_radii).abs().max() <= 1 and (radii != true_radii).sum() <= 2 * num_views
+    assert (radii - true_radii).abs().max() <= 1
+    assert (radii != true_radii).sum() <= 2 * num_views
     seen = seen & gsplat_compat.drawn(radii, found[0])
     for name, value, expected in zip(OUTPUTS, found, true, strict=True):
-        assert value.dtype == torch.float32 and value.shape == expected.shape
+        assert value.dtype == torch.float32
+        assert value.shape == expected.shape
         error = (value[seen] - expected[seen]).abs().max() / expected[seen].abs().max()
         assert error < 1e-6, (name, float(error))
     assert relative_errors(found[2][seen], true[2][seen]).max() < 1e-5
@@ -166,7 +170,8 @@ def test_conics_are_exact_where_the_determinant_cancels(name: str):
     radii, means2d, _, conics = by_the_kernel(scene, 1600, 1060)
     true_radii, true_means2d, _, true_conics = by_the_twin(scene, torch.float64, 1600, 1060)
     seen = gsplat_compat.drawn(radii, means2d)
-    assert torch.equal(seen, gsplat_compat.drawn(true_radii, true_means2d)) and seen.all()
+    assert torch.equal(seen, gsplat_compat.drawn(true_radii, true_means2d))
+    assert seen.all()
     assert relative_errors(conics, true_conics).max() < 1e-5
 
 
@@ -219,7 +224,8 @@ def test_what_has_no_finite_projection_is_not_drawn(value: str, per_axis_radii: 
         radii, *found = by_the_kernel(scene, WIDTH, HEIGHT)
         seen = gsplat_compat.drawn(radii, found[0])[0]
         assert seen.tolist() == [False] * columns + [True] * (9 - columns), name
-        assert all(output[0][seen].isfinite().all() for output in found)
+        for output in found:
+            assert output[0][seen].isfinite().all()
 
 
 @LAYOUTS
@@ -254,7 +260,8 @@ def test_scales_of_zero_leave_the_blur():
     radii, _, _, conics = by_the_kernel(scene, WIDTH, HEIGHT)
     assert (radii > 0).all()
     blur = 1 / gsplat_compat.SCREEN_BLUR
-    torch.testing.assert_close(conics, torch.tensor([blur, 0.0, blur]).expand(1, 2, 3), rtol=1e-6, atol=0)
+    expected = torch.tensor([blur, 0.0, blur]).expand(1, 2, 3)
+    torch.testing.assert_close(conics, expected, rtol=1e-6, atol=0)
 
 
 @pytest.mark.hard_case("a Gaussian behind, at and before the near plane", "it is drawn from the near plane on")
@@ -278,7 +285,8 @@ def test_no_gaussians_have_no_rows(per_axis_radii: bool, monkeypatch: Any):
         scene[name] = scene[name][:0]
     radii, *found = by_the_kernel(scene, WIDTH, HEIGHT)
     assert radii.shape == ((2, 0, 2) if per_axis_radii else (2, 0))
-    assert [output.shape for output in found] == [(2, 0, 2), (2, 0), (2, 0, 3)]
+    expected = [(2, 0, 2), (2, 0), (2, 0, 3)]
+    assert [output.shape for output in found] == expected
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
@@ -289,9 +297,11 @@ def test_it_is_as_close_to_float64_as_gsplat(num_views: int):
     inputs: dict[str, Any] = {name: value.float().to(DEVICE) for name, value in scene.items()}
     gsplats = [value.cpu() for value in gsplat_compat.project(**inputs, width=WIDTH, height=HEIGHT)]
     ours = by_the_kernel(scene, WIDTH, HEIGHT)
-    assert ours[0].shape == gsplats[0].shape and ours[0].dtype == gsplats[0].dtype
+    assert ours[0].shape == gsplats[0].shape
+    assert ours[0].dtype == gsplats[0].dtype
     # Rounding may move a radius over a whole number.
-    assert (ours[0] - gsplats[0]).abs().max() <= 1 and (ours[0] != gsplats[0]).sum() <= 4 * num_views
+    assert (ours[0] - gsplats[0]).abs().max() <= 1
+    assert (ours[0] != gsplats[0]).sum() <= 4 * num_views
     seen = gsplat_compat.drawn(true_radii, true[0])
     for projected in (ours, gsplats):
         seen = seen & gsplat_compat.drawn(projected[0], projected[1])
@@ -328,6 +338,7 @@ def test_a_cuda_graph_replays_it():
         results = projection_forward.project_forward(**inputs, width=WIDTH, height=HEIGHT)
     graph.replay()
     seen = gsplat_compat.drawn(expected[0], expected[1])
-    assert torch.equal(results[0], expected[0]) and seen.any()
+    assert torch.equal(results[0], expected[0])
+    assert seen.any()
     for value, of_launch in zip(results[1:], expected[1:], strict=True):
         assert torch.equal(value[seen], of_launch[seen])

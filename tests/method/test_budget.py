@@ -45,9 +45,11 @@ def train(strategy: StructureAwareStrategy, steps: int = 26) -> tuple[dict[str, 
 
 def test_the_allowed_growth_rises_from_nothing_to_all_and_ever_more_slowly():
     shares = torch.tensor([growth_share(part / 16) for part in range(17)])
-    assert shares[0] == 0 and shares[-1] == 1
+    assert shares[0] == 0
+    assert shares[-1] == 1
     steps = shares.diff()
-    assert (steps > 0).all() and (steps.diff() < 0).all()
+    assert (steps > 0).all()
+    assert (steps.diff() < 0).all()
 
 
 def test_the_budget_grows_from_the_first_count_and_never_exceeds_the_cap():
@@ -121,7 +123,9 @@ def test_what_fills_the_cap_cuts_the_longest_axis_into_as_many_parts_as_it_takes
     proposal = refill(options(), params, state, share)
     assert proposal.growth.tolist() == [parts - 1] * 20
     apply(proposal, torch.ones(20, dtype=torch.bool), params, adam(params), state)
-    assert len(params["means"]) == 20 * parts and all(p.isfinite().all() for p in params.values())
+    assert len(params["means"]) == 20 * parts
+    for p in params.values():
+        assert p.isfinite().all()
 
 
 def test_what_fills_the_cap_starts_with_the_steepest_and_ends_with_the_smallest_eta():
@@ -131,7 +135,9 @@ def test_what_fills_the_cap_starts_with_the_steepest_and_ends_with_the_smallest_
     state["eta_max"][3:, 0] = torch.tensor([20.0, 30.0])
     state["grad_count"] += 1
     priority = refill(options(), params, state, 0.5).priority
-    assert priority.argsort(descending=True).tolist() == [2, 0, 4, 3, 1]
+    actual = priority.argsort(descending=True).tolist()
+    expected = [2, 0, 4, 3, 1]
+    assert actual == expected
 
 
 def densify_together(world: World, cap: int) -> tuple[list[int], list[int]]:
@@ -164,9 +170,11 @@ def densify_together(world: World, cap: int) -> tuple[list[int], list[int]]:
 
 def test_several_processes_agree_on_the_budget(tmp_path: Path):
     counts, _ = densify_together(World(), 300)
-    assert counts[-1] == 300 and len(set(counts)) > 4
+    assert counts[-1] == 300
+    assert len(set(counts)) > 4
     for together, sizes in run_ranks(densify_together, 2, tmp_path / "meet", 300):
-        assert together == counts and sum(sizes) == 300
+        assert together == counts
+        assert sum(sizes) == 300
 
 
 def test_a_resumed_run_goes_on_with_its_budget(scene: Path, tmp_path: Path):
@@ -186,7 +194,8 @@ def test_a_resumed_run_goes_on_with_its_budget(scene: Path, tmp_path: Path):
     again.load_step = 8
     resumed = set_up(again)
     state = resumed.pipeline.model.strategy_state
-    assert state["first_count"] == start < 2000 and set(STATE_KEYS) <= set(state)
+    assert state["first_count"] == start < 2000
+    assert set(STATE_KEYS) <= set(state)
     resumed.train()
     assert 1995 <= whole.pipeline.model.num_points <= 2100
     for name, parameter in whole.pipeline.model.gauss_params.items():

@@ -22,7 +22,8 @@ from sadgs_ns.method.eta import (
 from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 def view(n: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
@@ -49,11 +50,13 @@ def axes_of(params, n: int) -> Tensor:
 
 def test_projected_axes_are_the_derivative_of_the_projection():
     """Eq. 1: v_k is where the axis's tip moves on the screen, per unit, for an infinitely small Gaussian."""
-    n, step = 20, 1e-6
+    n = 20
+    step = 1e-6
     params = random_params(n, dtype=torch.float64)
     viewmats, Ks = view(n)
     axes = axes_of(params, n)
-    quats, scales = params["quats"].detach(), params["scales"].detach().exp()
+    quats = params["quats"].detach()
+    scales = params["scales"].detach().exp()
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     columns = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], -1),
@@ -69,7 +72,8 @@ def test_projected_axes_are_the_derivative_of_the_projection():
         tip = step * scales[:, k, None] * direction
         means = params["means"].detach()
         moved = (project(means + tip) - project(means - tip)) / (2 * step)
-        torch.testing.assert_close(axes[:, k], moved, rtol=1e-6, atol=1e-7)
+        actual = axes[:, k]
+        torch.testing.assert_close(actual, moved, rtol=1e-6, atol=1e-7)
 
 
 def test_projected_axes_span_gsplat_s_2d_covariance():
@@ -85,7 +89,8 @@ def test_projected_axes_span_gsplat_s_2d_covariance():
     assert covars is not None
     means_c, covars_c = _world_to_cam(params["means"].detach(), covars, viewmats[:1])
     _, expected = _persp_proj(means_c, covars_c, Ks[:1], WIDTH, HEIGHT)
-    torch.testing.assert_close(axes.transpose(1, 2) @ axes, expected[0], rtol=1e-9, atol=1e-9)
+    actual = axes.transpose(1, 2) @ axes
+    torch.testing.assert_close(actual, expected[0], rtol=1e-9, atol=1e-9)
 
 
 def test_principal_eigenvalue_is_torch_s():
@@ -93,7 +98,8 @@ def test_principal_eigenvalue_is_torch_s():
     a = torch.rand((100, 2, 2), generator=generator, dtype=torch.float64)
     matrix = a @ a.mT
     packed = torch.stack([matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]], -1)
-    torch.testing.assert_close(principal_eigenvalue(packed), torch.linalg.eigvalsh(matrix)[:, 1])
+    expected = torch.linalg.eigvalsh(matrix)[:, 1]
+    torch.testing.assert_close(principal_eigenvalue(packed), expected)
 
 
 @pytest.mark.parametrize("difference", [0.0, 1e-12, 1e-7, 1e-4])
@@ -104,7 +110,9 @@ def test_principal_eigenvalue_is_stable_near_isotropy(difference: float):
 
 def test_wavelength_is_finite_without_texture():
     assert float(wavelength(torch.zeros(3))) == pytest.approx(1e5)
-    assert float(wavelength(torch.tensor([0.25, 0.0, 0.0]))) == pytest.approx(2.0, rel=1e-4)
+    actual = float(wavelength(torch.tensor([0.25, 0.0, 0.0])))
+    expected = pytest.approx(2.0, rel=1e-4)
+    assert actual == expected
 
 
 def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
@@ -117,8 +125,11 @@ def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
         conics,
         torch.rand((200_000, 2), generator=torch.Generator().manual_seed(0)),
     )
-    torch.testing.assert_close(points.mean(0), torch.tensor([20.0, 30.0]), rtol=0, atol=0.03)
-    torch.testing.assert_close(points.T.cov(), covariance, rtol=0.02, atol=0.05)
+    actual = points.mean(0)
+    expected = torch.tensor([20.0, 30.0])
+    torch.testing.assert_close(actual, expected, rtol=0, atol=0.03)
+    actual = points.T.cov()
+    torch.testing.assert_close(actual, covariance, rtol=0.02, atol=0.05)
     offset = points - torch.tensor([20.0, 30.0])
     distance = (offset @ torch.linalg.inv(covariance) * offset).sum(-1)
     assert distance.max() <= 4.001, "uniform in the 2σ ellipse, nothing outside"
@@ -128,7 +139,8 @@ def test_footprint_of_a_gaussian_thinner_than_the_blur_is_a_line_or_a_point():
     conics = torch.tensor([[1 / (4.0 + SCREEN_BLUR), 0.0, 1 / SCREEN_BLUR], [1 / SCREEN_BLUR, 0.0, 1 / SCREEN_BLUR]])
     points = sample_footprint(torch.zeros(2, 2), conics, torch.rand((2, 2), generator=torch.Generator().manual_seed(0)))
     assert points.isfinite().all()
-    assert abs(points[0, 1]) < 1e-2 and points[1].abs().max() < 1e-2
+    assert abs(points[0, 1]) < 1e-2
+    assert points[1].abs().max() < 1e-2
 
 
 def test_points_outside_the_image_are_no_observation():
@@ -136,7 +148,9 @@ def test_points_outside_the_image_are_no_observation():
     points = torch.tensor([[0.0, 0.0], [-0.01, 5.0], [WIDTH - 0.01, HEIGHT - 0.01], [WIDTH, 3.0], [float("nan"), 1.0]])
     values, inside = sample_map(tensors, torch.tensor([0, 1, 1, 0, 0]), points)
     assert inside.tolist() == [True, False, True, False, False]
-    assert values.dtype == torch.float32 and values[inside].eq(1).all() and values[~inside].eq(0).all()
+    assert values.dtype == torch.float32
+    assert values[inside].eq(1).all()
+    assert values[~inside].eq(0).all()
 
 
 @pytest.mark.hard_case("a sample on a masked pixel of S̄", "no observation")
@@ -148,7 +162,8 @@ def test_points_on_masked_pixels_are_no_observation(kept):
     tensors = kept(multiscale_structure_tensor(torch.full((1, HEIGHT, WIDTH, 3), 0.5), masks))
     points = torch.tensor([[WIDTH / 2 - 0.1, 5.0], [WIDTH / 2 + 0.1, 5.0], [WIDTH + 0.1, 5.0]])
     values, known = sample_map(tensors, torch.zeros(3, dtype=torch.long), points)
-    assert known.tolist() == [False, True, False] and values.eq(0).all()
+    assert known.tolist() == [False, True, False]
+    assert values.eq(0).all()
 
 
 def test_eta_equals_the_brute_force_footprint_average():
@@ -156,7 +171,8 @@ def test_eta_equals_the_brute_force_footprint_average():
     y, x = torch.meshgrid(torch.arange(96) + 0.5, torch.arange(96) + 0.5, indexing="ij")
     image = (0.5 + 0.4 * torch.sin(x * (0.5 + x / 120)) * torch.cos(y / 3))[None, ..., None].expand(1, 96, 96, 3)
     tensors = multiscale_structure_tensor(image.contiguous())
-    mean, covariance = torch.tensor([50.0, 44.0]), torch.tensor([[60.0, 25.0], [25.0, 30.0]])
+    mean = torch.tensor([50.0, 44.0])
+    covariance = torch.tensor([[60.0, 25.0], [25.0, 30.0]])
     offset = torch.stack([x, y], -1) - mean
     in_ellipse = (offset @ torch.linalg.inv(covariance) * offset).sum(-1) <= 4
     expected = tensors[0][in_ellipse].mean(0)
@@ -175,4 +191,6 @@ def test_eta_compares_the_axis_with_the_wavelength():
     """A grating along x: every axis is held against the one wavelength."""
     tensor = torch.tensor([[0.25, 0.0, 0.0]])  # Λ = 2 px along x
     axes = torch.tensor([[[4.0, 0.0], [0.0, 4.0], [3.0, 4.0]]])
-    torch.testing.assert_close(eta(axes, tensor), torch.tensor([[2.0, 2.0, 2.5]]), rtol=1e-4, atol=0)
+    actual = eta(axes, tensor)
+    expected = torch.tensor([[2.0, 2.0, 2.5]])
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=0)

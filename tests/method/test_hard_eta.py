@@ -45,7 +45,8 @@ photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is n
 tiles = pytest.importorskip("sadgs_ns.kernels.tiles", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 NEAR = 0.01
 """The splatter's and gsplat's near plane."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
@@ -71,7 +72,8 @@ def forward(params: dict[str, torch.nn.Parameter], focal: float) -> dict[str, An
     """Info of a forward pass before a uniform S̄."""
     viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=focal)
     renders, alphas, info = small_scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
-    assert renders.isfinite().all() and alphas.isfinite().all()
+    assert renders.isfinite().all()
+    assert alphas.isfinite().all()
     return {**info, "viewmats": viewmats, "Ks": Ks, "structure_tensors": uniform_map()}
 
 
@@ -84,12 +86,14 @@ def observed(params: dict[str, torch.nn.Parameter], info: dict[str, Any], rounds
         with triton_switched(fused), np.errstate(all="ignore"):
             for seed in range(rounds):
                 generator = torch.Generator(DEVICE).manual_seed(seed)
-                observe(
-                    state,
-                    {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()},
-                    {k: v.detach().to(DEVICE) if isinstance(v, Tensor) else v for k, v in info.items()},
-                    torch.rand(info["means2d"].shape, generator=generator, device=DEVICE),
-                )
+                copies = {name: torch.nn.Parameter(value.detach().to(DEVICE)) for name, value in params.items()}
+                on_device = {}
+                for name, value in info.items():
+                    if isinstance(value, Tensor):
+                        value = value.detach().to(DEVICE)
+                    on_device[name] = value
+                gradients = torch.rand(info["means2d"].shape, generator=generator, device=DEVICE)
+                observe(state, copies, on_device, gradients)
         assert all(value.isfinite().all() for value in state.values()), f"fused={fused}"
         results.append({name: value.cpu() for name, value in state.items()})
     slow, fast = results
@@ -101,7 +105,9 @@ def observed(params: dict[str, torch.nn.Parameter], info: dict[str, Any], rounds
 
 # --- where Gaussians lie ---
 
-INSIDE, OUTSIDE, SMALL = True, False, (-9.0, -9.0, -9.0)
+INSIDE = True
+OUTSIDE = False
+SMALL = (-9.0, -9.0, -9.0)
 
 
 @pytest.mark.hard_case(
@@ -147,7 +153,9 @@ def test_a_gaussian_that_contains_the_camera_is_seen_only_when_its_centre_is_bef
     state = observed(params, forward(params, 60.0), rounds=1)
     assert state["n_total"][0] == 0
     assert 0.03 < state["n_total"][1:].mean() < 0.15
-    assert state["eta_max"][:, 0].max() == pytest.approx(60 * math.sqrt(0.05), rel=1e-3)
+    actual = state["eta_max"][:, 0].max()
+    expected = pytest.approx(60 * math.sqrt(0.05), rel=1e-3)
+    assert actual == expected
 
 
 # --- how large and how thin they are ---
@@ -172,7 +180,9 @@ def test_log_scales_from_minus_30_to_30(focal: float):
     viewmats, Ks = small_scenes.camera(WIDTH, HEIGHT, focal=focal)
     renders, alphas, _ = small_scenes.splat(params, viewmats, Ks, WIDTH, HEIGHT)
     (renders.sum() + alphas.sum()).backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in params.values())
+    for p in params.values():
+        assert p.grad is not None
+        assert p.grad.isfinite().all()
 
 
 @pytest.mark.hard_case("projected axes of 10⁻²² to 10¹⁹ px", "η is right: it squares no length")
@@ -182,7 +192,8 @@ def test_eta_spans_the_whole_range_of_scales():
     axes = (10.0**exponents)[:, None, None] * torch.tensor([[3.0, 4.0], [1.0, 0.0], [0.0, 1.0]])
     tensor = torch.tensor([0.04, 0.0, 0.04]).expand(len(axes), 3)  # Λ = 5 px in every direction
     expected = (10.0 ** exponents.double())[:, None] * torch.tensor([1.0, 0.2, 0.2])
-    torch.testing.assert_close(eta(axes, tensor).double(), expected, rtol=1e-4, atol=0)
+    actual = eta(axes, tensor).double()
+    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=0)
 
 
 @pytest.mark.hard_case("depths down to 10⁻³⁰ (near plane 0)", "the Jacobian is right: it squares no depth")
@@ -192,7 +203,8 @@ def test_axes_at_depths_whose_square_underflows():
     axes = projected_axes(
         torch.tensor([[0.0, 0.0, 1e-30]]), torch.tensor([IDENTITY]), torch.full((1, 3), 1e-30), viewmats, Ks, 64, 48
     )
-    torch.testing.assert_close(axes, torch.tensor([[[50.0, 0.0], [0.0, 50.0], [0.0, 0.0]]]))
+    expected = torch.tensor([[[50.0, 0.0], [0.0, 50.0], [0.0, 0.0]]])
+    torch.testing.assert_close(axes, expected)
 
 
 @pytest.mark.hard_case("an aspect ratio of 10⁶", "samples stay within 2σ along the axis; η is that of the long axis")
@@ -213,11 +225,14 @@ def test_aspect_ratios_of_a_million(degrees: float):
     along = torch.tensor([math.cos(2 * half), math.sin(2 * half)])
     across = torch.tensor([-along[1], along[0]])
     assert (points @ across).abs().max() < 2.0
-    assert float((points @ along).std()) == pytest.approx(1000.0, rel=0.2) and (points @ along).abs().max() < 2400
+    assert float((points @ along).std()) == pytest.approx(1000.0, rel=0.2)
+    assert (points @ along).abs().max() < 2400
     copies = {name: torch.nn.Parameter(p.detach().repeat(300, *[1] * (p.dim() - 1))) for name, p in params.items()}
     state = observed(copies, forward(copies, 50.0), rounds=1)
     assert 0.005 < state["n_total"].mean() < 0.1
-    assert float(state["eta_max"].max()) == pytest.approx(1000 * math.sqrt(0.05), rel=1e-3)
+    actual = float(state["eta_max"].max())
+    expected = pytest.approx(1000 * math.sqrt(0.05), rel=1e-3)
+    assert actual == expected
 
 
 @pytest.mark.hard_case(
@@ -236,7 +251,9 @@ def test_samples_never_leave_the_footprint(long: float, short: float, angle: flo
     """Whatever rounding the conic to float32 does: no sample lies further than 2σ of the long axis, or 10⁴ px more."""
     rotation = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]).double()
     covariance = rotation @ torch.diag(torch.tensor([long, short]).double() ** 2) @ rotation.T
-    a, b, c = covariance[0, 0] + SCREEN_BLUR, covariance[0, 1], covariance[1, 1] + SCREEN_BLUR
+    a = covariance[0, 0] + SCREEN_BLUR
+    b = covariance[0, 1]
+    c = covariance[1, 1] + SCREEN_BLUR
     blurred = torch.tensor([long, short]).double() ** 2 + SCREEN_BLUR
     conic = (torch.stack([c, -b, a]) / blurred.prod()).float()[None]
     point = sample_footprint(torch.zeros(1, 2), conic, torch.tensor([jitter]))
@@ -279,10 +296,11 @@ def test_singular_conics(conic: tuple[float, float, float], counts: bool):
 def test_unnormalised_quaternions_are_the_rotation_that_they_point_at(length: float):
     quat = torch.tensor([0.5, 0.1, 0.7, -0.3])
     scales = (-1.0, -2.0, -3.0)
-    unit, scaled = (
-        parameters([((0.1, 0.2, 4), scales, tuple((factor * quat / quat.norm()).tolist()))]) for factor in (1.0, length)
-    )
-    expected, actual = (observed(params, forward(params, 60.0)) for params in (unit, scaled))
+    unit_quat = quat / quat.norm()
+    unit = parameters([((0.1, 0.2, 4), scales, tuple(unit_quat.tolist()))])
+    scaled = parameters([((0.1, 0.2, 4), scales, tuple((length * quat / quat.norm()).tolist()))])
+    expected = observed(unit, forward(unit, 60.0))
+    actual = observed(scaled, forward(scaled, 60.0))
     torch.testing.assert_close(actual["eta_max"], expected["eta_max"], rtol=1e-4, atol=1e-5)
 
 
@@ -290,8 +308,10 @@ def test_unnormalised_quaternions_are_the_rotation_that_they_point_at(length: fl
 @pytest.mark.parametrize("quat", [(0.0, 0.0, 0.0, 0.0), (1e-20, 0.0, 1e-20, 0.0), (1e25, 1e25, 0.0, 0.0)])
 def test_quaternions_without_direction_are_the_identity(quat: tuple[float, float, float, float]):
     """Zero, or of a length that float32 cannot square."""
-    plain, broken = (parameters([((0.1, 0.2, 4), (-1, -2, -3), q)]) for q in (IDENTITY, quat))
-    expected, actual = (observed(params, forward(params, 60.0)) for params in (plain, broken))
+    plain = parameters([((0.1, 0.2, 4), (-1, -2, -3), IDENTITY)])
+    broken = parameters([((0.1, 0.2, 4), (-1, -2, -3), quat)])
+    expected = observed(plain, forward(plain, 60.0))
+    actual = observed(broken, forward(broken, 60.0))
     torch.testing.assert_close(actual["eta_max"], expected["eta_max"], rtol=1e-4, atol=1e-5)
 
 
@@ -319,7 +339,8 @@ def test_what_is_not_finite_is_no_observation(where: str, bad: float):
         info[where][0, 0] = bad
     state = observed(params, info)
     is_number = where == "scales" and bad == -math.inf  # the logarithm of a scale of 0
-    assert state["n_total"].tolist() == [3.0 * is_number, 3.0] and (state["eta_max"][1, :2] > 0).all()
+    assert state["n_total"].tolist() == [3.0 * is_number, 3.0]
+    assert (state["eta_max"][1, :2] > 0).all()
 
 
 @pytest.mark.hard_case("garbage in the projection of culled Gaussians", "is never read")
@@ -328,7 +349,8 @@ def test_what_is_culled_may_be_anything():
     params = parameters([((0, 0, 0), (-5, -5, -5), IDENTITY), ((0, 0, 1), (-5, -5, -5), IDENTITY)])
     info = forward(params, 50.0)
     info |= {name: info[name].detach().clone() for name in ("means2d", "conics")}
-    info["means2d"][0, 0], info["conics"][0, 0] = math.nan, math.inf
+    info["means2d"][0, 0] = math.nan
+    info["conics"][0, 0] = math.inf
     state = observed(params, info)
     assert state["n_total"].tolist() == [0.0, 3.0]
 
@@ -368,7 +390,8 @@ def extreme_ellipses(n: int = 192) -> dict[str, Tensor]:
     def random(*shape: int) -> Tensor:
         return torch.rand((1, n, *shape), generator=generator, dtype=torch.float64)
 
-    lengths, angles = 10 ** (10 * random(2) - 1.5), math.pi * random()
+    lengths = 10 ** (10 * random(2) - 1.5)
+    angles = math.pi * random()
     angles[:, ::3] = (4 * random()[:, ::3]).round() * math.pi / 4
     rotation = torch.stack([angles.cos(), -angles.sin(), angles.sin(), angles.cos()], -1).reshape(1, n, 2, 2)
     variances = lengths**2 + SCREEN_BLUR
@@ -378,8 +401,14 @@ def extreme_ellipses(n: int = 192) -> dict[str, Tensor]:
     means2d[:, 1::4] += ((random(2) - 0.5) * 10 ** (9 * random(1)))[:, 1::4]
     conics = torch.stack([inverses[..., 0, 0], inverses[..., 0, 1], inverses[..., 1, 1]], -1)
     opacities = random()
-    means2d[:, 5], means2d[:, 6, 0], means2d[:, 7], means2d[:, 8] = math.nan, math.nan, math.inf, -math.inf
-    conics[:, 10], conics[:, 11], conics[:, 12], opacities[:, 13] = 0.0, math.nan, math.inf, math.nan
+    means2d[:, 5] = math.nan
+    means2d[:, 6, 0] = math.nan
+    means2d[:, 7] = math.inf
+    means2d[:, 8] = -math.inf
+    conics[:, 10] = 0.0
+    conics[:, 11] = math.nan
+    conics[:, 12] = math.inf
+    opacities[:, 13] = math.nan
     radii = (3 * variances.amax(-1).sqrt()).ceil().clamp_max(2**31 - 200).int()
     values = {"means2d": means2d, "depths": random(), "conics": conics, "opacities": opacities}
     return {**{name: value.float() for name, value in values.items()}, "radii": radii}
@@ -390,14 +419,17 @@ def extreme_ellipses(n: int = 192) -> dict[str, Tensor]:
     "no needed tile is missed, none is invented; NaN and infinite centres are in none",
 )
 def test_tile_lists_of_extreme_and_broken_gaussians_miss_none_and_invent_none():
-    gaussians, size = extreme_ellipses(), 8
+    gaussians = extreme_ellipses()
+    size = 8
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
     with np.errstate(invalid="ignore"):  # inf − inf, of the broken conics
         starts, ids, _ = tiles.intersect_tiles(**on_device, width=WIDTH, height=HEIGHT, tile_size=size).lists()
     assert int(starts[0, 0, 0]) == 0
     columns = WIDTH // size
-    means2d, radii = gaussians["means2d"][0].double(), gaussians["radii"][0, :, None].double()
-    opacities, conics = gaussians["opacities"][0], gaussians["conics"][0].double()
+    means2d = gaussians["means2d"][0].double()
+    radii = gaussians["radii"][0, :, None].double()
+    opacities = gaussians["opacities"][0]
+    conics = gaussians["conics"][0].double()
     n_listed = 0
     for number, listed in enumerate(ids.cpu().tensor_split(starts.cpu().flatten().tolist()[1:])):
         corner = torch.tensor([number % columns, number // columns])
@@ -406,7 +438,8 @@ def test_tile_lists_of_extreme_and_broken_gaussians_miss_none_and_invent_none():
         a, b, c = conics[..., None].unbind(1)
         sigma = (a * delta[..., 0] ** 2 + c * delta[..., 1] ** 2) / 2 + b * delta[..., 0] * delta[..., 1]
         reaches = ((opacities[:, None] * torch.exp(-sigma) >= 1 / 255) & (sigma >= 0)).any(1)
-        low, high = ((means2d - radii) / size).floor(), ((means2d + radii) / size).ceil()
+        low = ((means2d - radii) / size).floor()
+        high = ((means2d + radii) / size).ceil()
         in_square = ((low <= corner) & (high > corner)).all(1) & (opacities >= 1 / 255)
         have = set(listed.tolist())
         assert len(have) == len(listed)
@@ -452,7 +485,8 @@ def test_a_broken_pixel_shows_in_the_loss(value: float):
 )
 def test_broken_harmonics_show_in_the_colour_and_distant_ones_are_finite():
     means = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1e25], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]], device=DEVICE)
-    first, rest = torch.ones((4, 3), device=DEVICE), torch.ones((4, 15, 3), device=DEVICE)
+    first = torch.ones((4, 3), device=DEVICE)
+    rest = torch.ones((4, 15, 3), device=DEVICE)
     first[3, 1] = math.nan
     with np.errstate(over="ignore"):
         colors = harmonics.colors_from_harmonics(

@@ -66,7 +66,8 @@ def assert_sound(tensor: Tensor, mask: Tensor | None = None) -> None:
     assert tensor.isfinite().all()
     xx, xy, yy = tensor.double().unbind(-1)
     smaller = 0.5 * (xx + yy) - torch.hypot(0.5 * (xx - yy), xy)
-    assert (xx >= 0).all() and (yy >= 0).all()
+    assert (xx >= 0).all()
+    assert (yy >= 0).all()
     assert (smaller >= -1e-6 * (xx + yy)).all()
     assert (xx + yy).max() <= 1 + 1e-5
 
@@ -79,7 +80,8 @@ def assert_sound(tensor: Tensor, mask: Tensor | None = None) -> None:
 @pytest.mark.parametrize("value", [0.0, 1 / 255, 0.7, 1e4])
 def test_a_constant_image_has_exactly_no_structure(dtype: torch.dtype, value: float):
     tensor = unit_tensor(torch.full((1, 33, 50, 3), value, dtype=dtype))
-    assert tensor.eq(0).all() and wavelength(tensor).min() == pytest.approx(1e5)
+    assert tensor.eq(0).all()
+    assert wavelength(tensor).min() == pytest.approx(1e5)
 
 
 @pytest.mark.hard_case(
@@ -90,7 +92,8 @@ def test_a_line_of_one_pixel_is_the_shortest_wavelength_and_points_across():
     image[:, :, 32] = 1.0
     tensor = unit_tensor(image)
     assert_sound(tensor)
-    assert tensor[0, 32, 32, 0] > 0.98 and tensor[..., 2].max() < 1e-6
+    assert tensor[0, 32, 32, 0] > 0.98
+    assert tensor[..., 2].max() < 1e-6
     assert (tensor[0, 32, 32, 0] >= tensor[0, 32, :, 0]).all(), "strongest on the line"
 
 
@@ -122,7 +125,8 @@ def test_texture_just_below_the_nyquist_frequency_is_seen():
 @pytest.mark.parametrize("scale", [1e-37, 1 / 255, 1.0, 1e4, 1e38])
 def test_amplitude_from_one_grey_level_to_hdr_changes_nothing(scale: float):
     image = noise(1, 40, 50, 3)
-    torch.testing.assert_close(unit_tensor(scale * image), unit_tensor(image), rtol=0, atol=1e-6)
+    actual = unit_tensor(scale * image)
+    torch.testing.assert_close(actual, unit_tensor(image), rtol=0, atol=1e-6)
 
 
 @pytest.mark.hard_case("two neighbouring grey levels of 8 bits", "the same S̄ as in black and white")
@@ -143,7 +147,8 @@ def test_one_hdr_pixel_makes_the_rest_of_the_image_fade():
     image[0, 5, 5] = 1e4
     tensor = unit_tensor(image)
     assert_sound(tensor)
-    assert tensor[0, 5, 5].sum() > 0.5 and tensor[0, 80:, 80:].max() < 1e-3
+    assert tensor[0, 5, 5].sum() > 0.5
+    assert tensor[0, 80:, 80:].max() < 1e-3
 
 
 @pytest.mark.hard_case(
@@ -163,7 +168,9 @@ def test_noise_is_short_and_nearly_isotropic():
     tensor = unit_tensor(noise(1, 96, 96, 3))
     assert_sound(tensor)
     mean = tensor.mean((0, 1, 2))
-    assert abs(float(mean[0] - mean[2])) < 0.05 and abs(float(mean[1])) < 0.05 and mean[[0, 2]].sum() > 0.95
+    assert abs(float(mean[0] - mean[2])) < 0.05
+    assert abs(float(mean[1])) < 0.05
+    assert mean[[0, 2]].sum() > 0.95
 
 
 # --- sizes, masks, alpha, what is not finite ---
@@ -179,7 +186,8 @@ def test_images_of_any_size(height: int, width: int):
     image = noise(2, height, width, 3)
     tensor = unit_tensor(image)
     assert_sound(tensor)
-    torch.testing.assert_close(unit_tensor(image.transpose(1, 2)).transpose(1, 2).flip(-1), tensor, rtol=0, atol=1e-6)
+    actual = unit_tensor(image.transpose(1, 2)).transpose(1, 2).flip(-1)
+    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-6)
     assert height * width > 1 or tensor.eq(0).all()
 
 
@@ -188,7 +196,8 @@ def test_a_single_row_reads_a_grating_as_a_whole_image_does():
     whole = unit_tensor(grating(9.0, size=192))[:, 96:97, 60:130, 0]
     row = unit_tensor(grating(9.0, size=192)[:, 96:97])[..., 60:130, :]
     assert row[..., 1:].abs().max() < 1e-6
-    torch.testing.assert_close(row[..., 0], whole, rtol=1e-4, atol=0)
+    actual = row[..., 0]
+    torch.testing.assert_close(actual, whole, rtol=1e-4, atol=0)
 
 
 @pytest.mark.hard_case("a mask with 0, 1 or 2 distant valid pixels", "S̄ = 0 there, NaN at masked pixels")
@@ -196,18 +205,22 @@ def test_a_single_row_reads_a_grating_as_a_whole_image_does():
 def test_masks_that_leave_almost_nothing(valid: int):
     """Nothing, one pixel, or two that no kernel connects: no pair of pixels, no structure."""
     mask = torch.zeros(1, 64, 80, dtype=torch.bool)
-    mask[0, 10, 10], mask[0, 60, 75] = valid > 0, valid > 1
+    mask[0, 10, 10] = valid > 0
+    mask[0, 60, 75] = valid > 1
     tensor = unit_tensor(noise(1, 64, 80, 3), mask)
-    assert tensor[mask].eq(0).all() and tensor[~mask].isnan().all()
+    assert tensor[mask].eq(0).all()
+    assert tensor[~mask].isnan().all()
 
 
 @pytest.mark.hard_case("NaN, ±inf or 3·10³⁸ under a mask", "bitwise the same S̄ as without")
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38])
 def test_what_lies_under_a_mask_does_not_matter(value: float):
-    image, mask = noise(1, 40, 50, 3), noise(1, 40, 50, seed=1) > 0.3
+    image = noise(1, 40, 50, 3)
+    mask = noise(1, 40, 50, seed=1) > 0.3
     painted = torch.where(mask[..., None], image, value)
     expected = unit_tensor(image, mask)
-    torch.testing.assert_close(unit_tensor(painted, mask), expected, rtol=0, atol=0, equal_nan=True)
+    actual = unit_tensor(painted, mask)
+    torch.testing.assert_close(actual, expected, rtol=0, atol=0, equal_nan=True)
     assert_sound(expected, mask)
 
 
@@ -221,7 +234,8 @@ def test_transparent_pixels_are_the_background():
     tensor = unit_tensor(composite(torch.cat([hidden, alpha], -1), torch.ones(3)))
     edge = torch.where(alpha > 0, 0.5, torch.ones(1, 96, 96, 3))
     assert torch.equal(tensor, unit_tensor(edge))
-    assert tensor[0, 48, 40, 0] > 0.1 and tensor[..., 2].max() < 1e-6
+    assert tensor[0, 48, 40, 0] > 0.1
+    assert tensor[..., 2].max() < 1e-6
 
 
 @pytest.mark.hard_case("NaN or ±inf in a valid pixel", "ValueError with the image's index")
@@ -297,7 +311,8 @@ def test_directions_are_uncertain_near_the_nyquist_frequency(period: float, erro
 @pytest.mark.parametrize("period", [5.0, 6.5, 8.0, 10.0, 12.0])
 def test_a_magnified_grating_has_a_longer_wavelength(period: float):
     """Times 1.5, the step between levels: nearly that, for the levels end at σ = 1 and 5 px."""
-    small, large = (wavelength(central(unit_tensor(grating(p, 20, size=192)))) for p in (period, 1.5 * period))
+    small = wavelength(central(unit_tensor(grating(period, 20, size=192))))
+    large = wavelength(central(unit_tensor(grating(1.5 * period, 20, size=192))))
     assert 1.25 < large / small < 1.75
 
 
@@ -307,7 +322,8 @@ def test_a_magnified_grating_has_a_longer_wavelength(period: float):
 )
 def test_wavelengths_saturate_beyond_the_levels():
     constant = 1 / (2 * math.pi)  # the wavelength then reads as a period
-    shortest, longest = 2 * math.pi, 2 * math.pi * 1.5**4
+    shortest = 2 * math.pi
+    longest = 2 * math.pi * 1.5**4
     for period, size in ((2.5, 96), (4.0, 96), (48.0, 256), (100.0, 256)):
         read = wavelength(central(multiscale_structure_tensor(grating(period, 20, size), frequency_constant=constant)))
         assert read == pytest.approx(shortest if period < 5 else longest, rel=0.12)
@@ -324,7 +340,8 @@ def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool
         flipped = unit_tensor(image.flip(axis), mask.flip(axis)).flip(axis)
         torch.testing.assert_close(flipped * SIGNS, tensor, rtol=0, atol=1e-12, equal_nan=True)
     turned = unit_tensor(image.rot90(1, (1, 2)), mask.rot90(1, (1, 2))).rot90(-1, (1, 2))
-    torch.testing.assert_close(turned.flip(-1) * SIGNS, tensor, rtol=0, atol=1e-12, equal_nan=True)
+    actual = turned.flip(-1) * SIGNS
+    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-12, equal_nan=True)
 
 
 # --- nearly isotropic tensors ---
@@ -342,7 +359,8 @@ def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool
 def test_the_eigenvalue_of_a_nearly_isotropic_tensor_does_not_cancel(trace: float, anisotropy: float, angle: float):
     """In float32, against float64 of the same float32 numbers, over 60 decades."""
     half = 0.5 * trace
-    along, across = anisotropy * half * math.cos(2 * angle), anisotropy * half * math.sin(2 * angle)
+    along = anisotropy * half * math.cos(2 * angle)
+    across = anisotropy * half * math.sin(2 * angle)
     tensor = torch.tensor([half + along, across, half - along], dtype=torch.float32)
     xx, xy, yy = tensor.double().tolist()
     expected = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy)

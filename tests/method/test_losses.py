@@ -20,15 +20,18 @@ def test_loss_is_the_stated_sum():
     predicted, target = images(2, 20, 30, 3)
     loss, psnr = photometric_loss(predicted, target, ssim_lambda=0.3, l2_lambda=1.5)
     similarity = ssim(predicted.permute(0, 3, 1, 2), target.permute(0, 3, 1, 2), data_range=1.0)
-    l1, l2 = (predicted - target).abs().mean(), (predicted - target).square().mean()
-    torch.testing.assert_close(loss, 0.7 * l1 + 0.3 * (1 - similarity) + 1.5 * l2)
+    l1 = (predicted - target).abs().mean()
+    l2 = (predicted - target).square().mean()
+    expected = 0.7 * l1 + 0.3 * (1 - similarity) + 1.5 * l2
+    torch.testing.assert_close(loss, expected)
     torch.testing.assert_close(psnr, 10 * torch.log10(1 / l2))
 
 
 def test_equal_images_cost_nothing():
     _, target = images(1, 16, 16, 3)
     loss, psnr = photometric_loss(target, target)
-    assert abs(float(loss)) < 1e-6 and psnr == math.inf
+    assert abs(float(loss)) < 1e-6
+    assert psnr == math.inf
 
 
 def test_gradient_by_finite_differences():
@@ -40,4 +43,5 @@ def test_colours_outside_the_unit_interval_get_gradients():
     predicted = torch.full((1, 16, 16, 3), 1.2, requires_grad=True)
     loss, _ = photometric_loss(predicted, torch.ones(1, 16, 16, 3))
     loss.backward()
-    assert predicted.grad is not None and (predicted.grad > 0).all()
+    assert predicted.grad is not None
+    assert (predicted.grad > 0).all()

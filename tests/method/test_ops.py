@@ -27,8 +27,10 @@ def test_it_changes_what_gsplats_own_changes(names: list[str] | None):
     for name, parameter in params.items():
         assert torch.equal(parameter, expected[name])
         assert optimizers[name].param_groups[0]["params"][0] is parameter
-        state, other = optimizers[name].state[parameter], others[name].state[expected[name]]
-        assert state.keys() == other.keys() and all(torch.equal(state[key], other[key]) for key in state)
+        state = optimizers[name].state[parameter]
+        other = others[name].state[expected[name]]
+        assert state.keys() == other.keys()
+        assert all(torch.equal(state[key], other[key]) for key in state)
 
 
 def test_a_parameter_that_is_not_trained_needs_no_optimizer():

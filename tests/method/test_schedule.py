@@ -53,13 +53,20 @@ def test_effort_above_1_adds_fewer_visits_where_views_are_few(num_views: int, fa
     for effort in (1.0, 0.5, 2.0, 4.0):
         derived = schedule(num_views, effort=effort)
         visits.append(derived.iterations * derived.views_per_iteration)
-    assert [more / visits[0] for more in visits[1:]] == pytest.approx(factors, rel=2e-3)
+    actual = [more / visits[0] for more in visits[1:]]
+    expected = pytest.approx(factors, rel=2e-3)
+    assert actual == expected
 
 
 def test_effort_lets_more_grow_where_views_are_many_and_a_draft_as_much():
-    assert [growth_threshold(effort, 100) for effort in (0.1, 0.5, 1.0)] == [1.0, 1.0, 1.0]
-    assert [growth_threshold(effort, 100) for effort in (2, 4, 8)] == pytest.approx([0.801, 0.642, 0.514], abs=1e-3)
-    assert [growth_threshold(4, views) for views in (3, 20, 40, 60)] == pytest.approx([1, 1, 0.801, 0.642], abs=1e-3)
+    actual = [growth_threshold(effort, 100) for effort in (0.1, 0.5, 1.0)]
+    assert actual == [1.0, 1.0, 1.0]
+    actual = [growth_threshold(effort, 100) for effort in (2, 4, 8)]
+    expected = pytest.approx([0.801, 0.642, 0.514], abs=1e-3)
+    assert actual == expected
+    actual = [growth_threshold(4, views) for views in (3, 20, 40, 60)]
+    expected = pytest.approx([1, 1, 0.801, 0.642], abs=1e-3)
+    assert actual == expected
 
 
 @pytest.mark.parametrize(
@@ -105,12 +112,18 @@ def test_windows_of_the_shortest_runs_lie_within_them(iterations: int):
 
 def test_windows_that_are_given_stay_but_for_an_end_too_late_to_recover_from():
     given = {"structure_every": 0, "absgs_every": 7, "refine_start_iter": 3, "reset_every": 0, "eta_every": 1}
-    assert windows(300, refine_stop_iter=50, **given) == Windows(0, 7, 3, 50, 0, 1)
+    actual = windows(300, refine_stop_iter=50, **given)
+    expected = Windows(0, 7, 3, 50, 0, 1)
+    assert actual == expected
     assert windows(300, refine_stop_iter=300).refine_stop_iter == 190
     assert windows(300, refine_start_iter=200).refine_stop_iter == 0
     assert windows(300, refine_stop_iter=0).refine_stop_iter == 0
 
 
 def test_factors_on_rates_go_from_one_view_to_four_and_no_further():
-    assert [between_one_and_four(views, 9.0) for views in (1, 2, 4, 8)] == pytest.approx([1.0, 3.0, 9.0, 9.0])
-    assert [between_one_and_four(views, 0.25) for views in (1, 2, 4)] == pytest.approx([1.0, 0.5, 0.25])
+    actual = [between_one_and_four(views, 9.0) for views in (1, 2, 4, 8)]
+    expected = pytest.approx([1.0, 3.0, 9.0, 9.0])
+    assert actual == expected
+    actual = [between_one_and_four(views, 0.25) for views in (1, 2, 4)]
+    expected = pytest.approx([1.0, 0.5, 0.25])
+    assert actual == expected

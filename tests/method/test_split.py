@@ -22,7 +22,9 @@ from sadgs_ns.method.split import (
 def test_split_factor_is_the_ceiling_of_the_root():
     eta_max = torch.tensor([[0.5, 1.0, 1.01], [4.0, 4.01, 9.5]])
     violates = torch.tensor([[True, True, True], [True, True, False]])
-    assert children_per_axis(eta_max, violates).tolist() == [[1, 1, 2], [2, 3, 1]]
+    actual = children_per_axis(eta_max, violates).tolist()
+    expected = [[1, 1, 2], [2, 3, 1]]
+    assert actual == expected
 
 
 @pytest.mark.hard_case(
@@ -37,11 +39,17 @@ def test_no_parent_explodes(eta_max: float):
 def test_budget_goes_to_the_largest_violations():
     growth = torch.tensor([7, 1, 0, 3, 5])
     priority = torch.tensor([2.0, 9.0, 99.0, 4.0, 3.0])
-    assert limit_growth(World(), growth, priority, 9).tolist() == [False, True, False, True, True]
-    assert limit_growth(World(), growth, priority, 8).tolist() == [False, True, False, True, False]
+    actual = limit_growth(World(), growth, priority, 9).tolist()
+    expected = [False, True, False, True, True]
+    assert actual == expected
+    actual = limit_growth(World(), growth, priority, 8).tolist()
+    expected = [False, True, False, True, False]
+    assert actual == expected
     assert not limit_growth(World(), growth, priority, 0).any()
     assert not limit_growth(World(), growth, priority, -5).any()
-    assert limit_growth(World(), growth, priority, 10**9).tolist() == [True, True, False, True, True]
+    actual = limit_growth(World(), growth, priority, 10**9).tolist()
+    expected = [True, True, False, True, True]
+    assert actual == expected
 
 
 def test_the_cap_is_never_exceeded():
@@ -55,9 +63,11 @@ def test_the_cap_is_never_exceeded():
 def test_grid_is_centred_and_its_variance_completes_the_child_s():
     parents, grid = grid_offsets(torch.tensor([[1, 2, 3], [4, 1, 1]]))
     assert parents.tolist() == [0] * 6 + [1] * 4
-    torch.testing.assert_close(grid[:6].mean(0), torch.zeros(3))
+    actual = grid[:6].mean(0)
+    torch.testing.assert_close(actual, torch.zeros(3))
     expected = torch.tensor([0.0, 1 - 1 / 4, 1 - 1 / 9])  # plus 1/n² of the child itself is 1
-    torch.testing.assert_close(grid[:6].square().mean(0), expected)
+    actual = grid[:6].square().mean(0)
+    torch.testing.assert_close(actual, expected)
     spacing = grid[7, 0] - grid[6, 0]
     assert float(spacing) == pytest.approx(math.sqrt(12) / 4)
 
@@ -78,15 +88,20 @@ def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_s
     own = child_rotation @ torch.diag_embed((2 * children["scales"]).exp()) @ child_rotation.mT
     offset = children["means"] - parent["means"]
     mixture = own.mean(0) + (offset.T @ offset) / len(offset)
-    torch.testing.assert_close(children["means"].mean(0), parent["means"], rtol=1e-12, atol=1e-12)
+    actual = children["means"].mean(0)
+    torch.testing.assert_close(actual, parent["means"], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
     for name in ("features_dc", "quats"):
-        torch.testing.assert_close(children[name], parent[name].expand_as(children[name]))
+        expected = parent[name].expand_as(children[name])
+        torch.testing.assert_close(children[name], expected)
     if child_scale == 1:  # the paper's are as opaque as the parent
-        torch.testing.assert_close(children["opacities"], parent["opacities"].expand_as(children["opacities"]))
+        expected = parent["opacities"].expand_as(children["opacities"])
+        torch.testing.assert_close(children["opacities"], expected)
     # And the integral of opacity: opacity times the product of scales.
     mass = [torch.sigmoid(p["opacities"].flatten()) * p["scales"].exp().prod(dim=-1) for p in (parent, children)]
-    torch.testing.assert_close(mass[1].sum(), mass[0].sum(), rtol=1e-12, atol=0)
+    actual = mass[1].sum()
+    expected = mass[0].sum()
+    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=0)
 
 
 @pytest.mark.hard_case(
@@ -102,7 +117,8 @@ def test_children_of_extreme_opacity_have_finite_logits(logit: float):
     expected = math.log(share) + logit if logit < 0 else math.log(share / (1 - share))
     if abs(logit) >= 30:
         assert params["opacities"].tolist() == pytest.approx([expected] * 6, rel=1e-6)
-    assert torch.sigmoid(params["opacities"]).tolist() == pytest.approx([share / (1 + math.exp(-logit))] * 6, rel=1e-5)
+    actual = torch.sigmoid(params["opacities"]).tolist()
+    assert actual == pytest.approx([share / (1 + math.exp(-logit))] * 6, rel=1e-5)
 
 
 def test_larger_children_fill_the_gaps_between_them():
@@ -141,7 +157,8 @@ def test_split_nearly_keeps_the_render():
     grid_split(params, adam(params, lr=0.0), {}, torch.tensor([[2, 2, 1]]))
     after = alpha()
     assert len(params["means"]) == 4
-    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.05)
+    expected = pytest.approx(float(before.sum()), rel=0.05)
+    assert float(after.sum()) == expected
     coarse = [torch.nn.functional.avg_pool2d(a.permute(0, 3, 1, 2), 16) for a in (before, after)]  # 16 px: 2 parent σ
     assert float((coarse[1] - coarse[0]).abs().mean()) < 0.15 * float(before.mean())
 
@@ -151,16 +168,24 @@ def test_optimizer_state_and_statistics_follow():
     optimizers = adam(params)
     state = {"n_total": torch.arange(5.0), "eta_max": torch.arange(15.0).view(5, 3), "scene_scale": 2.0}
     counts = torch.ones((5, 3), dtype=torch.long)
-    counts[1, 0], counts[3, 2] = 2, 3
+    counts[1, 0] = 2
+    counts[3, 2] = 3
     moments = optimizers["means"].state[params["means"]]["exp_avg"].clone()
     kept = [0, 2, 4]
     grid_split(params, optimizers, state, counts)
-    assert all(len(p) == 8 for p in params.values())
-    assert state["n_total"].tolist() == [0, 2, 4, 0, 0, 0, 0, 0], "nobody has observed the children"
-    assert state["eta_max"][:3].tolist() == [[0, 1, 2], [6, 7, 8], [12, 13, 14]] and not state["eta_max"][3:].any()
+    for p in params.values():
+        assert len(p) == 8
+    expected = [0, 2, 4, 0, 0, 0, 0, 0]
+    assert state["n_total"].tolist() == expected, "nobody has observed the children"
+    actual = state["eta_max"][:3].tolist()
+    expected = [[0, 1, 2], [6, 7, 8], [12, 13, 14]]
+    assert actual == expected
+    assert not state["eta_max"][3:].any()
     for name, optimizer in optimizers.items():
         assert optimizer.param_groups[0]["params"][0] is params[name]
         slots = optimizer.state[params[name]]
-        assert slots["exp_avg"].shape == params[name].shape and not slots["exp_avg"][3:].any()
+        assert slots["exp_avg"].shape == params[name].shape
+        assert not slots["exp_avg"][3:].any()
         assert float(slots["step"]) == 1
-    torch.testing.assert_close(optimizers["means"].state[params["means"]]["exp_avg"][:3], moments[kept])
+    actual = optimizers["means"].state[params["means"]]["exp_avg"][:3]
+    torch.testing.assert_close(actual, moments[kept])

@@ -13,7 +13,8 @@ from sadgs_ns.method.quantization import quantize
 from sadgs_ns.method.statistics import consistent, empty_statistics
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 def forward(params, structure_tensor: list[float], per_axis_radii: bool, views: int = 1) -> dict[str, Any]:
@@ -41,7 +42,8 @@ def three_gaussians():
 def test_counts_by_hand(per_axis_radii: bool):
     params = three_gaussians()
     statistics = empty_statistics(3, torch.device("cpu"))
-    coarse, fine = [0.01, 0.0, 0.0], [1.0, 0.0, 0.0]  # Λ of 10 px and of 1 px
+    coarse = [0.01, 0.0, 0.0]  # Λ of 10 px
+    fine = [1.0, 0.0, 0.0]  # Λ of 1 px
     steps = 40
     for structure_tensor in (coarse, fine):
         for _ in range(steps // 2):
@@ -49,10 +51,13 @@ def test_counts_by_hand(per_axis_radii: bool):
     n = float(statistics["n_total"][0])
     assert 0.8 * steps < n <= steps, "a sample that falls beside the image is no observation"
     # Axis 0: η = 1.5 and 15; axis 1: 0.15 and 1.5; axis 2 points into depth: 0 and 0.
-    assert statistics["n_high"][0].tolist()[0] == n and statistics["n_high"][0, 2] == 0
+    assert statistics["n_high"][0].tolist()[0] == n
+    assert statistics["n_high"][0, 2] == 0
     assert 0 < statistics["n_high"][0, 1] < n
     assert statistics["n_low"][0].tolist() == [0.0, 0.0, n]
-    torch.testing.assert_close(statistics["eta_max"][0], torch.tensor([15.0, 1.5, 0.0]), rtol=1e-3, atol=1e-3)
+    actual = statistics["eta_max"][0]
+    expected = torch.tensor([15.0, 1.5, 0.0])
+    torch.testing.assert_close(actual, expected, rtol=1e-3, atol=1e-3)
     for key in ("n_total", "n_high", "n_low", "eta_max"):
         assert not statistics[key][1:].any(), "the unseen have no statistics"
 
@@ -63,7 +68,8 @@ def test_two_views_count_twice():
     params["scales"].data = params["scales"].data - 3  # every sample lies inside the image
     observe(one, params, forward(params, [1.0, 0.0, 0.0], False))
     observe(two, params, forward(params, [1.0, 0.0, 0.0], False, views=2))
-    assert float(one["n_total"][0]) == 1 and float(two["n_total"][0]) == 2
+    assert float(one["n_total"][0]) == 1
+    assert float(two["n_total"][0]) == 2
 
 
 @pytest.mark.hard_case(
@@ -79,7 +85,8 @@ def test_faint_gaussians_are_observed_as_opaque_ones_are():
         torch.manual_seed(0)
         observe(statistics, params, forward(params, [1.0, 0.0, 0.0], False))
         counts.append(statistics["n_total"].tolist())
-    assert counts[0] == counts[1] and sum(counts[0]) > 0
+    assert counts[0] == counts[1]
+    assert sum(counts[0]) > 0
 
 
 def test_textureless_pixels_are_low_not_high():
@@ -87,7 +94,8 @@ def test_textureless_pixels_are_low_not_high():
     params["scales"].data.fill_(-3.0)
     statistics = empty_statistics(3, torch.device("cpu"))
     observe(statistics, params, forward(params, [0.0, 0.0, 0.0], False))
-    assert statistics["n_low"][0].tolist() == [1.0] * 3 and not statistics["n_high"].any()
+    assert statistics["n_low"][0].tolist() == [1.0] * 3
+    assert not statistics["n_high"].any()
 
 
 @pytest.mark.hard_case(
@@ -106,8 +114,10 @@ def test_masked_pixels_are_no_observation(kept):
     statistics = empty_statistics(3, torch.device("cpu"))
     observe(statistics, params, info)
     assert statistics["n_total"].tolist() == [0.0, 1.0, 0.0]
-    assert statistics["n_low"].tolist() == [[0.0] * 3, [1.0] * 3, [0.0] * 3]
-    assert not statistics["n_high"].any() and (statistics["eta_max"] < 0.1).all()
+    expected = [[0.0] * 3, [1.0] * 3, [0.0] * 3]
+    assert statistics["n_low"].tolist() == expected
+    assert not statistics["n_high"].any()
+    assert (statistics["eta_max"] < 0.1).all()
 
 
 def test_garbage_of_the_unseen_never_enters():
@@ -120,7 +130,8 @@ def test_garbage_of_the_unseen_never_enters():
     info["conics"][:, 1:] = float("inf")
     statistics = empty_statistics(3, torch.device("cpu"))
     observe(statistics, params, info)
-    assert all(value.isfinite().all() for value in statistics.values())
+    for value in statistics.values():
+        assert value.isfinite().all()
 
 
 @pytest.mark.hard_case(
@@ -130,5 +141,7 @@ def test_garbage_of_the_unseen_never_enters():
 def test_consistency_is_a_fraction_of_enough_observations():
     counts = torch.tensor([[9.0, 8.0, 0.0], [0.0, 0.0, 0.0]])
     total = torch.tensor([10.0, 0.0])
-    assert consistent(counts, total, 0.8).tolist() == [[True, False, False], [False, False, False]]
+    actual = consistent(counts, total, 0.8).tolist()
+    expected = [[True, False, False], [False, False, False]]
+    assert actual == expected
     assert not consistent(counts, total, 0.8, min_observations=11).any(), "fewer observations say nothing"

@@ -20,7 +20,8 @@ from sadgs_ns.method.statistics import STATISTICS, Statistic, empty_statistics
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 @pytest.fixture(autouse=True)
@@ -74,7 +75,8 @@ def train(
         counts.append(len(params["means"]))
         assert counts[-1] <= options.max_gaussians
         assert all(len(value) == counts[-1] for value in state.values() if isinstance(value, torch.Tensor))
-        assert all(p.isfinite().all() for p in params.values())
+        for p in params.values():
+            assert p.isfinite().all()
     return params, state, counts
 
 
@@ -98,17 +100,20 @@ def test_drops_into_a_plain_gsplat_loop(per_axis_radii: bool, views: int):
 def test_options_densify_as_the_strategy_that_is_made_of_them():
     options = short(max_gaussians=3000)
     strategy = options.for_run(3000)
-    assert isinstance(options, Strategy) and isinstance(strategy, Strategy)
+    assert isinstance(options, Strategy)
+    assert isinstance(strategy, Strategy)
     params, state, counts = train(options, 26)
     same_params, same_state, same_counts = train(options, 26, strategy=strategy)
-    assert counts == same_counts and state == same_state
+    assert counts == same_counts
+    assert state == same_state
     for name, parameter in params.items():
         assert torch.equal(parameter, same_params[name])
 
 
 def test_structure_step_splits_in_one_step_and_forgets_the_parents():
     _, state, counts = train(short(absgs_every=0, tau_split=0.3), 12)
-    assert counts[8] == 60 and counts[9] > 100
+    assert counts[8] == 60
+    assert counts[9] > 100
     assert float(state["n_total"].max()) <= 2, "two steps since the split"
 
 
@@ -117,9 +122,11 @@ def test_over_a_run_no_gaussian_has_more_observations_than_iterations_of_life():
     strategy = short(max_gaussians=3000, clone_grad2d=1e-5, split_absgrad2d=1e-5, tau_split=0.3, min_observations=3)
     params = random_params(60)
     params["scales"].data += 1.0
-    optimizers, state = adam(params), strategy.initialize_state(scene_scale=1.0)
+    optimizers = adam(params)
+    state = strategy.initialize_state(scene_scale=1.0)
     optimizers["means"].state[params["means"]]["age"] = torch.zeros(60)
-    images, (viewmats, Ks) = checker_images(1), camera(WIDTH, HEIGHT)
+    images = checker_images(1)
+    viewmats, Ks = camera(WIDTH, HEIGHT)
     tensors = multiscale_structure_tensor(images)
     newborn = observed = 0
     for step in range(strategy.windows.refine_stop_iter - 1):
@@ -131,8 +138,10 @@ def test_over_a_run_no_gaussian_has_more_observations_than_iterations_of_life():
         for name in ("n_high", "n_low"):
             assert (state[name] <= state["n_total"][:, None]).all()
         assert not state["eta_max"][state["n_total"] == 0].any()
-        newborn, observed = newborn + int((age == 0).sum()), observed + int((state["n_total"] > 0).sum())
-    assert newborn > 100 and observed > 1000
+        newborn = newborn + int((age == 0).sum())
+        observed = observed + int((state["n_total"] > 0).sum())
+    assert newborn > 100
+    assert observed > 1000
 
 
 def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypatch: pytest.MonkeyPatch):
@@ -140,10 +149,15 @@ def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypa
     monkeypatch.setitem(STATISTICS, "eta_sum", Statistic((3,), lambda values, eta: values.add_(eta.nansum(0))))
     growing = {"clone_grad2d": 1e-3, "split_absgrad2d": 2e-3, "min_opacity": 0.1, "refine_stop_iter": 30}
     _, state, counts = train(short(max_gaussians=3000, **growing), 24)
-    assert counts[9] > 5 * counts[8] and counts[23] < counts[22], "split in a structure step, and pruned in another"
-    eta_sum, eta_max, n_total = (state[name] for name in ("eta_sum", "eta_max", "n_total"))
-    assert (n_total > 1).any() and (n_total == 0).any(), "clones and children of the last step"
-    assert (eta_max * (1 - 1e-5) <= eta_sum).all() and (eta_sum <= eta_max * n_total[:, None] * (1 + 1e-5)).all()
+    assert counts[9] > 5 * counts[8], "split in a structure step, and pruned in another"
+    assert counts[23] < counts[22], "split in a structure step, and pruned in another"
+    eta_sum = state["eta_sum"]
+    eta_max = state["eta_max"]
+    n_total = state["n_total"]
+    assert (n_total > 1).any(), "clones and children of the last step"
+    assert (n_total == 0).any(), "clones and children of the last step"
+    assert (eta_max * (1 - 1e-5) <= eta_sum).all()
+    assert (eta_sum <= eta_max * n_total[:, None] * (1 + 1e-5)).all()
     _, state, _ = train(short(), 26)
     assert "eta_sum" not in state, "it ends with densification, like the others"
 
@@ -160,10 +174,13 @@ def test_a_rule_of_growth_is_added_in_one_entry_and_keeps_to_the_cap(monkeypatch
     monkeypatch.setitem(RULES, "longest", Rule(lambda windows: 3, longest))
     strategy = short(max_gaussians=200, structure_every=0, clone_grad2d=1e9, split_absgrad2d=1e9)
     running = strategy.for_run(3000)
-    assert running.densifies(2) and running.densifies(3) and not running.densifies(4)
+    assert running.densifies(2)
+    assert running.densifies(3)
+    assert not running.densifies(4)
     _, state, counts = train(strategy, 11)
     assert counts == [60, 60, 120, 120, 120, *[200] * 6]
-    assert state["grad_count"].any() and strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
+    assert state["grad_count"].any(), "AbsGS will read them at iteration 12"
+    assert strategy.needs_absgrad(9), "AbsGS will read them at iteration 12"
 
 
 @pytest.mark.usefixtures("whole_cap")
@@ -206,9 +223,11 @@ def test_rules_that_are_due_together_share_the_budget_of_a_step(monkeypatch: pyt
     asked.clear()
     strategy.max_gaussians = 1000
     _, state, counts = train(strategy, 10)
-    assert asked[2:] == [("structure", counts[8]), ("longest", 2 * counts[8])], "a structure step replaces AbsGS"
+    expected = [("structure", counts[8]), ("longest", 2 * counts[8])]
+    assert asked[2:] == expected, "a structure step replaces AbsGS"
     (step,) = state["structure_steps"]
-    assert step["split"] == counts[8] and step["after"] == counts[9]
+    assert step["split"] == counts[8]
+    assert step["after"] == counts[9]
 
 
 @pytest.mark.parametrize("cap", [60, 61, 150, 400])
@@ -223,7 +242,9 @@ def test_nothing_happens_outside_the_window():
     _, _, counts = train(short(refine_start_iter=12, refine_stop_iter=14, absgs_every=0), 26)
     assert set(counts) == {60}
     _, _, counts = train(short(refine_start_iter=12, refine_stop_iter=20, absgs_every=0), 26)
-    assert counts[18] == 60 and counts[19] > 60 and len(set(counts[19:])) == 1
+    assert counts[18] == 60
+    assert counts[19] > 60
+    assert len(set(counts[19:])) == 1
 
 
 def test_window_fits_short_runs_and_keeps_long_ones():
@@ -234,37 +255,47 @@ def test_window_fits_short_runs_and_keeps_long_ones():
 
 def test_windows_follow_the_length_of_the_run_but_for_those_that_are_given():
     strategy = StructureAwareStrategy(reset_every=0, eta_every=7)
-    assert strategy.for_run(6000).windows == Windows(
+    expected = Windows(
         structure_every=1000, absgs_every=200, refine_start_iter=200, refine_stop_iter=3200, reset_every=0, eta_every=7
     )
+    assert strategy.for_run(6000).windows == expected
     fitted = strategy.fitted(3000)
     assert fitted.windows.structure_every == fitted.structure_every == strategy.windows.structure_every == 500
-    assert strategy.structure_every is None and fitted.fitted(3000) == fitted
-    assert strategy.for_run(3000) == fitted.for_run(3000) and strategy.for_run(3000).windows == fitted.windows
+    assert strategy.structure_every is None
+    assert fitted.fitted(3000) == fitted
+    assert strategy.for_run(3000) == fitted.for_run(3000)
+    assert strategy.for_run(3000).windows == fitted.windows
 
 
 def test_a_run_too_short_to_densify_prepares_nothing_for_it():
     strategy = StructureAwareStrategy(structure_every=50, absgs_every=10, refine_start_iter=500)
     strategy = strategy.for_run(700)  # 443 would be before 500
-    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(700))
+    for step in range(700):
+        assert not (strategy.observes(step) or strategy.needs_absgrad(step))
     assert strategy.windows.refine_stop_iter == 0
 
 
 def test_eta_is_observed_only_where_a_structure_step_will_read_it():
     strategy = StructureAwareStrategy(structure_every=500, refine_stop_iter=1900, eta_every=10).for_run(3000)
-    assert strategy.observes(0) and strategy.observes(1490)
-    assert not strategy.observes(5) and not strategy.observes(1500) and not strategy.observes(2500)
+    assert strategy.observes(0)
+    assert strategy.observes(1490)
+    assert not strategy.observes(5)
+    assert not strategy.observes(1500)
+    assert not strategy.observes(2500)
 
 
 def test_gradients_are_kept_only_where_an_absgs_step_will_read_them():
     strategy = StructureAwareStrategy(refine_start_iter=100, absgs_every=100, structure_every=500)
     strategy.refine_stop_iter = 1600
     needed = {step + 1 for step in range(3000) if strategy.needs_absgrad(step)}  # iterations
-    assert needed == set(range(1, 401)) | set(range(501, 901)) | set(range(1001, 1401)) | set(range(1501, 1601))
+    expected = set(range(1, 401)) | set(range(501, 901)) | set(range(1001, 1401)) | set(range(1501, 1601))
+    assert needed == expected
     strategy.structure_every = 0
-    assert all(strategy.needs_absgrad(step) == (step < 1600) for step in range(3000))
+    for step in range(3000):
+        assert strategy.needs_absgrad(step) == (step < 1600)
     strategy.absgs_every = 0
-    assert not any(strategy.needs_absgrad(step) for step in range(3000))
+    for step in range(3000):
+        assert not strategy.needs_absgrad(step)
 
 
 def test_keeping_all_gradients_changes_nothing(monkeypatch: pytest.MonkeyPatch):
@@ -274,7 +305,9 @@ def test_keeping_all_gradients_changes_nothing(monkeypatch: pytest.MonkeyPatch):
     assert not all(hoarder.needs_absgrad(step) for step in range(24))
     monkeypatch.setattr(hoarder, "needs_absgrad", lambda step: step < hoarder.windows.refine_stop_iter)
     hoarded, _, same = train(thrifty, 26, strategy=hoarder)
-    assert counts == same and counts[3] > 60 and counts[9] > counts[8]
+    assert counts == same
+    assert counts[3] > 60
+    assert counts[9] > counts[8]
     for name, parameter in plain.items():
         assert torch.equal(parameter, hoarded[name])
 
@@ -307,7 +340,8 @@ def test_statistics_end_with_densification():
 def test_final_prune_removes_the_faint_once(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(strategy_module, "FINAL_PRUNE_OPACITY", 0.5)
     params, _, counts = train(short(absgs_every=0, structure_every=0), 26)
-    assert counts[22] == 60 and 0 < counts[23] < 60
+    assert counts[22] == 60
+    assert 0 < counts[23] < 60
     assert len(set(counts[23:])) == 1
     assert len(params["means"]) == counts[-1]
 
@@ -319,19 +353,26 @@ def test_the_final_prune_spares_children_of_what_it_would_have_kept(end: str, mo
     params["opacities"].data = torch.logit(torch.tensor([0.05, 0.12, 0.5, 0.12]))
     state = {"scene_scale": 1.0, **empty_statistics(4, torch.device("cpu")), **empty_gradients(4, torch.device("cpu"))}
     state["n_total"] += 10
-    state["n_high"][:3, 0], state["eta_max"][:3, 0] = 10.0, 4.0  # all but the last are split in two
+    # All but the last are split in two.
+    state["n_high"][:3, 0] = 10.0
+    state["eta_max"][:3, 0] = 4.0
     stop = 20 if end == "with a structure step" else 21
     strategy = short(refine_stop_iter=stop, structure_every=20, absgs_every=0, child_scale=1.5, reset_every=0)
     optimizers = adam(params, lr=0.0)
     strategy.step_post_backward(params, optimizers, state, 19, [])
     # 0.12 / 1.5 is under the final prune's 0.1: at the very end such children are new, later they had their chance.
-    faint, parents = params["opacities"].sigmoid() < 0.1, state["structure_steps"][0]["split"]
+    faint = params["opacities"].sigmoid() < 0.1
+    parents = state["structure_steps"][0]["split"]
     if end == "with a structure step":
-        assert parents == 2 and len(faint) == 5 and faint.sum() == 2
+        assert parents == 2
+        assert len(faint) == 5
+        assert faint.sum() == 2
     else:
-        assert parents == 3 and len(faint) == 7
+        assert parents == 3
+        assert len(faint) == 7
         strategy.step_post_backward(params, optimizers, state, 20, [])
-        assert len(params["means"]) == 3 and (params["opacities"].sigmoid() >= 0.1).all()
+        assert len(params["means"]) == 3
+        assert (params["opacities"].sigmoid() >= 0.1).all()
 
 
 def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch):
@@ -351,7 +392,8 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
 def test_pruning_never_leaves_nothing():
     params = random_params(5)
     n = short().for_run(3000)._prune(params, adam(params), {}, 1.0)
-    assert n == 0 and len(params["means"]) == 5
+    assert n == 0
+    assert len(params["means"]) == 5
 
 
 def gradient_state(grad: list[float], absgrad: list[float]) -> dict[str, Any]:
@@ -378,7 +420,9 @@ def test_absgs_clones_on_the_mean_and_splits_on_the_absolute_gradient():
     assert grow_with(params, state) == (1, 1)
     assert len(params["means"]) == 6
     scales = params["scales"].exp()[:, 0]
-    torch.testing.assert_close(scales.sort().values, torch.tensor([0.05, 0.05, 0.05, 0.3125, 0.3125, 0.5]))
+    actual = scales.sort().values
+    expected = torch.tensor([0.05, 0.05, 0.05, 0.3125, 0.3125, 0.5])
+    torch.testing.assert_close(actual, expected)
 
 
 def test_absgs_halves_the_longest_axis_in_its_place():
@@ -391,14 +435,16 @@ def test_absgs_halves_the_longest_axis_in_its_place():
     children = {name: parameter.detach()[3:].unflatten(0, (2, 2)) for name, parameter in params.items()}
     parents = {name: value[[1, 2]] for name, value in before.items()}
     axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
-    torch.testing.assert_close(
-        children["scales"].exp(), (parents["scales"].exp() * (0.8 - 0.3 * axes))[:, None].repeat(1, 2, 1)
-    )
-    torch.testing.assert_close(children["means"].mean(dim=1), parents["means"])
+    actual = children["scales"].exp()
+    expected = (parents["scales"].exp() * (0.8 - 0.3 * axes))[:, None].repeat(1, 2, 1)
+    torch.testing.assert_close(actual, expected)
+    actual = children["means"].mean(dim=1)
+    torch.testing.assert_close(actual, parents["means"])
     offset = (children["means"][:, 1] - children["means"][:, 0]) / 2
     torch.testing.assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
     for name in ("quats", "opacities", "features_dc"):
-        torch.testing.assert_close(children[name], parents[name][:, None].expand_as(children[name]))
+        expected = parents[name][:, None].expand_as(children[name])
+        torch.testing.assert_close(children[name], expected)
 
 
 @pytest.mark.hard_case(
@@ -423,8 +469,10 @@ def test_absgs_spends_a_budget_on_the_steepest():
     params = random_params(3)
     params["scales"].data.fill_(-5.0)
     means = params["means"].detach().clone()
-    assert grow_with(params, gradient_state([3e-4, 9e-4, 4e-4], [0.0] * 3), budget=1) == (1, 0)
-    torch.testing.assert_close(params["means"].detach()[3], means[1])
+    actual = grow_with(params, gradient_state([3e-4, 9e-4, 4e-4], [0.0] * 3), budget=1)
+    assert actual == (1, 0)
+    actual = params["means"].detach()[3]
+    torch.testing.assert_close(actual, means[1])
 
 
 def test_gradients_are_normalised_as_in_3dgs():
@@ -435,8 +483,10 @@ def test_gradients_are_normalised_as_in_3dgs():
     info = {"means2d": means2d, "radii": torch.tensor([[1, 1, 0], [0, 2, 0]]), "width": 64, "height": 48}
     gradients = empty_gradients(3, torch.device("cpu"))
     accumulate_gradients(gradients, info, num_views=2)
-    torch.testing.assert_close(gradients["grad2d"], torch.tensor([5.0, 10.0, 0.0]))
-    torch.testing.assert_close(gradients["absgrad2d"], torch.tensor([10.0, 20.0, 0.0]))
+    expected = torch.tensor([5.0, 10.0, 0.0])
+    torch.testing.assert_close(gradients["grad2d"], expected)
+    expected = torch.tensor([10.0, 20.0, 0.0])
+    torch.testing.assert_close(gradients["absgrad2d"], expected)
     assert gradients["grad_count"].tolist() == [1, 2, 0]
 
 
@@ -453,7 +503,8 @@ def test_wrong_use_is_named():
 def test_what_would_be_split_now_keeps_to_the_cap():
     statistics = empty_statistics(3, torch.device("cpu"))
     statistics["n_total"][:] = 1
-    statistics["eta_max"][0, 0], statistics["eta_max"][1, 1] = 4.0, 9.0
+    statistics["eta_max"][0, 0] = 4.0
+    statistics["eta_max"][1, 1] = 9.0
     statistics["n_high"][:] = (statistics["eta_max"] > 1).to(statistics["n_high"])
     params = random_params(3)
     strategy = StructureAwareStrategy(max_gaussians=6, min_observations=1, split_min_opacity=0.0)
@@ -461,13 +512,18 @@ def test_what_would_be_split_now_keeps_to_the_cap():
     def planned() -> torch.Tensor:
         return strategy.for_run(3000).planned_children(params, statistics)
 
-    assert planned().tolist() == [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    expected = [[2, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert planned().tolist() == expected
     strategy.max_gaussians = 5  # room for two more: √4 for one comes before √9 for two
-    assert planned().tolist() == [[2, 1, 1], [1, 1, 1], [1, 1, 1]]
+    expected = [[2, 1, 1], [1, 1, 1], [1, 1, 1]]
+    assert planned().tolist() == expected
     strategy.max_gaussians = 2
     assert (planned() == 1).all()
-    strategy.max_gaussians, strategy.min_observations = 6, 2
+    strategy.max_gaussians = 6
+    strategy.min_observations = 2
     assert (planned() == 1).all(), "one observation is no consistency"
-    strategy.min_observations, strategy.split_min_opacity = 1, 0.5
+    strategy.min_observations = 1
+    strategy.split_min_opacity = 0.5
     params["opacities"].data = torch.logit(torch.tensor([0.4, 0.6, 0.6]))
-    assert planned().tolist() == [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    expected = [[1, 1, 1], [1, 3, 1], [1, 1, 1]]
+    assert planned().tolist() == expected

@@ -65,7 +65,9 @@ def test_equal_models_agree_and_misplaced_photos_disagree(model: pycolmap.Recons
     similar.transform(pycolmap.Sim3d(2.5, pycolmap.Rotation3d(np.array([0.3, -0.2, 0.5])), np.array([4.0, -1.0, 2.0])))
     assert disagreement(model, similar) < 1e-6
     # A focal length of WIDTH px, so that three of ten photos move by a fifth of their width.
-    assert disagreement(model, misplaced(model, 0.2)) == pytest.approx(0.3 * 0.2, rel=0.2)
+    actual = disagreement(model, misplaced(model, 0.2))
+    expected = pytest.approx(0.3 * 0.2, rel=0.2)
+    assert actual == expected
 
 
 def test_points_behind_a_camera_count_as_moved_across_the_photo(model: pycolmap.Reconstruction):
@@ -97,10 +99,14 @@ def test_of_three_models_one_of_those_that_agree_is_kept(model: pycolmap.Reconst
 
     wrong = misplaced(model, 0.3)
     kept, moved = most_agreed(wrong, place_again, rank)
-    assert numbers == [1, 2] and moved < 1e-6 and disagreement(kept, model) < 1e-6
+    assert numbers == [1, 2]
+    assert moved < 1e-6
+    assert disagreement(kept, model) < 1e-6
     numbers.clear()
     kept, moved = most_agreed(model, place_again, rank)
-    assert numbers == [1] and moved < 1e-6 and kept is model
+    assert numbers == [1]
+    assert moved < 1e-6
+    assert kept is model
 
 
 @pytest.mark.hard_case("photos that few points hold together, placed otherwise each time", "told as doubtful or wrong")
@@ -121,12 +127,14 @@ def test_a_model_with_far_fewer_photos_confirms_but_does_not_replace(model: pyco
     kept, _ = most_agreed(wrong, lambda number: copy.deepcopy(few), rank)
     assert kept is wrong
     kept, moved = most_agreed(model, lambda number: copy.deepcopy(few), rank)
-    assert kept is model and moved < 1e-6
+    assert kept is model
+    assert moved < 1e-6
 
 
 def test_photos_that_cannot_be_placed_again_are_not_judged_by_that(model: pycolmap.Reconstruction):
     kept, moved = most_agreed(model, lambda number: None, rank)
-    assert kept is model and math.isnan(moved)
+    assert kept is model
+    assert math.isnan(moved)
 
 
 def test_the_disagreement_reaches_the_summary(placed: Path, model: pycolmap.Reconstruction):
@@ -164,7 +172,8 @@ def test_other_samples_verify_the_matches_in_a_copy(placed: Path, tmp_path: Path
     names = [f"{i:02d}.png" for i in range(VIEWS)]
     reconstruct.place_cameras(placed / "photos", names, tmp_path / "database.db", tmp_path / "model", None)
     assert seeds == [1000]
-    assert inliers(tmp_path / "database.db") == before and not (tmp_path / "again.db").exists()
+    assert inliers(tmp_path / "database.db") == before
+    assert not (tmp_path / "again.db").exists()
 
 
 def test_settling_brings_back_a_focal_length_and_the_observations(placed: Path, model: pycolmap.Reconstruction):

@@ -84,14 +84,18 @@ def test_values_of_few_bits_are_scaled_by_the_largest_of_all_photos(
     Image.new("RGB", SIZE, (1, 2, 3)).save(photos / "e.png")
     assert main([str(photos), str(tmp_path / "out")]) == 0
     white = 2**depth - 1
-    middle, low = (round(255 * value / white) for value in (150, 99))
+    middle = round(255 * 150 / white)
+    low = round(255 * 99 / white)
     pixels = taken[0].pixels
     assert left(pixels["a.png"]) == [middle, low, 0]
     assert left(pixels["b.png"]) == [round(255 * largest / white)] * 3
     assert left(pixels["c.png"]) == [0, low, middle]
     assert left(pixels["d.tif"]) == [middle] * 3
-    assert left(pixels["e.png"]) == [1, 2, 3] and taken[0].unchanged == {"e.png"}
-    assert all(image.dtype == np.uint8 and image[:, 8:].max() <= 3 for image in pixels.values())
+    assert left(pixels["e.png"]) == [1, 2, 3]
+    assert taken[0].unchanged == {"e.png"}
+    for image in pixels.values():
+        assert image.dtype == np.uint8
+        assert image[:, 8:].max() <= 3
     told = f"4 photos of 16 bits use {depth} of them (largest value {largest:,}): {white:,} becomes white.\n"
     assert told in capsys.readouterr().out
 
@@ -119,7 +123,8 @@ def test_the_bits_that_were_chosen_first_stay(tmp_path: Path, taken: list[Taken]
     write(photos, d=stored(0, 0, 819), e=stored(60000))
     capsys.readouterr()
     assert main(command) == 0
-    assert left(taken[0].pixels["b.png"]) == [51, 51, 51] and left(taken[1].pixels["d.png"]) == [51, 0, 0]
+    assert left(taken[0].pixels["b.png"]) == [51, 51, 51]
+    assert left(taken[1].pixels["d.png"]) == [51, 0, 0]
     assert left(taken[1].pixels["e.png"]) == [255, 255, 255]
     told = (
         "use 12 of them (largest value 60,000): 4,095 becomes white. The first photos of the scene decided this; 1 of"
@@ -169,7 +174,8 @@ def test_opacity_is_scaled_by_the_bits_that_it_uses(opaque: int, tmp_path: Path)
     file = write(tmp_path, a=pixels) / "a.png"
     with Image.open(file) as image:
         scaled = np.asarray(read_scaled(image, file, 12))
-    assert left(scaled) == [255, 51, 0, 255] and (scaled[:, 8:] == [0, 0, 0, 51]).all()
+    assert left(scaled) == [255, 51, 0, 255]
+    assert (scaled[:, 8:] == [0, 0, 0, 51]).all()
 
 
 def test_scaled_photos_are_turned_and_their_profile_is_used(tmp_path: Path, taken: list[Taken]):
@@ -182,9 +188,13 @@ def test_scaled_photos_are_turned_and_their_profile_is_used(tmp_path: Path, take
     assert main([str(photos), str(tmp_path / "out")]) == 0
     for name in ("a.png", "d.tif"):
         turned = taken[0].pixels[name]
-        assert turned.shape == (12, 8, 3) and (turned[:6] == 255).all() and not turned[6:].any()
+        assert turned.shape == (12, 8, 3)
+        assert (turned[:6] == 255).all()
+        assert not turned[6:].any()
     red, green, blue = left(taken[0].pixels["b.png"])
-    assert red <= 6 and green >= 249 and blue <= 6
+    assert red <= 6
+    assert green >= 249
+    assert blue <= 6
 
 
 def with_profile(file: Path, profile: bytes) -> None:

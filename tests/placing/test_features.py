@@ -37,9 +37,12 @@ def test_a_blob_is_found_where_it_is_and_as_large_as_it_is(features, blob: Path,
     nearest = keypoints[np.linalg.norm(keypoints[:, :2] - CENTER, axis=1).argmin()]
     assert nearest[:2] == pytest.approx([CENTER[0] + 0.5, CENTER[1] + 0.5], abs=0.25)  # A pixel's centre is at a half.
     assert nearest[2] == pytest.approx(6.0, rel=0.3)
-    assert keypoints.dtype == np.float32 and descriptors.dtype == np.uint8
+    assert keypoints.dtype == np.float32
+    assert descriptors.dtype == np.uint8
     assert descriptors.shape == (len(keypoints), 128)
-    assert np.linalg.norm(descriptors.astype(float), axis=1) == pytest.approx(512, rel=0.01)
+    actual = np.linalg.norm(descriptors.astype(float), axis=1)
+    expected = pytest.approx(512, rel=0.01)
+    assert actual == expected
 
 
 def test_the_file_s_own_pixels_are_searched_whatever_orientation_exif_tells(features, blob: Path, tmp_path: Path):
@@ -48,9 +51,11 @@ def test_the_file_s_own_pixels_are_searched_whatever_orientation_exif_tells(feat
     with Image.open(blob) as image:
         image.save(tmp_path / "upright.jpg", quality=100)
         image.save(tmp_path / "turned.jpg", quality=100, exif=exif)
-    upright, turned = features.sift(tmp_path / "upright.jpg"), features.sift(tmp_path / "turned.jpg")
+    upright = features.sift(tmp_path / "upright.jpg")
+    turned = features.sift(tmp_path / "turned.jpg")
     assert len(upright[0]) > 0
-    assert np.array_equal(upright[0], turned[0]) and np.array_equal(upright[1], turned[1])
+    assert np.array_equal(upright[0], turned[0])
+    assert np.array_equal(upright[1], turned[1])
 
 
 @pytest.mark.parametrize("content", [b"no image", "empty"])
@@ -61,7 +66,8 @@ def test_what_cannot_be_searched_has_no_features(features, tmp_path: Path, conte
     else:
         Image.new("RGB", (64, 64)).save(path)
     keypoints, descriptors = features.sift(path)
-    assert keypoints.shape == (0, 4) and descriptors.shape == (0, 128)
+    assert keypoints.shape == (0, 4)
+    assert descriptors.shape == (0, 128)
 
 
 def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Path, monkeypatch):
@@ -69,7 +75,9 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
     names = [f"{k}.png" for k in range(4)]
     for name, pixels in zip(names, noise, strict=True):
         Image.fromarray(cv2.resize(pixels, (160, 120))).save(tmp_path / name)
-    searched, told, sift = [], [], features.sift
+    searched = []
+    told = []
+    sift = features.sift
 
     def noting(photo: Path, mask: Path):
         searched.append(photo.name)
@@ -86,7 +94,8 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
         images = opened.read_all_images()
         assert {image.name for image in images} == set(names)
         assert len({image.camera_id for image in images}) == 1  # The photos of a group share one.
-        assert all(opened.num_keypoints_for_image(image.image_id) > 0 for image in images)
+        for image in images:
+            assert opened.num_keypoints_for_image(image.image_id) > 0
 
 
 def test_no_more_photos_are_searched_at_a_time_than_memory_holds(features, monkeypatch):
@@ -118,10 +127,13 @@ def test_photos_are_taken_by_lots_as_all_at_once(features, tmp_path: Path, monke
         features.extract(tmp_path, [names[:4], names[4:]], database, [views])
         with pycolmap.Database.open(database) as opened:
             images = {image.name: image for image in opened.read_all_images()}
-            cameras = [[images[name].camera_id for name in group] for group in (names[:4], names[4:])]
-            assert len({*cameras[0]}) == 1 and len({*cameras[0], *cameras[1]}) == 2
+            cameras = [images[name].camera_id for name in names]
+            cameras = [cameras[:4], cameras[4:]]
+            assert len({*cameras[0]}) == 1
+            assert len({*cameras[0], *cameras[1]}) == 2
             rigs = [rig.num_sensors() for rig in opened.read_all_rigs()]
             held.append(
                 (sorted(rigs), {name: opened.read_keypoints(images[name].image_id).tolist() for name in images})
             )
-    assert held[0] == held[1] and len(held[0][1]) == len(names) + len(views)
+    assert held[0] == held[1]
+    assert len(held[0][1]) == len(names) + len(views)

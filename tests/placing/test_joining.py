@@ -39,12 +39,14 @@ def test_a_large_folder_has_a_camera_where_exif_tells_no_focal_length(photos: li
     groups = photos_by_camera_and_folder(photos)
     assert [len(group) for group in groups] == counts
     alike = [set(names) for names in photos_by_camera(photos)]
-    assert all(any(names.issuperset(group) for names in alike) for group in groups)
+    for group in groups:
+        assert any(names.issuperset(group) for names in alike)
 
 
 def centres(phase: float) -> np.ndarray:
     """The drawn room's centres, moved along their arc by an angle in rad. [COUNT, 3]"""
-    cosine, sine = np.cos(phase), np.sin(phase)
+    cosine = np.cos(phase)
+    sine = np.sin(phase)
     return camera_centres() @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
 
 
@@ -59,7 +61,8 @@ def camera_of_folders(model: pycolmap.Reconstruction) -> dict[str, int]:
     cameras: dict[str, set[int]] = {}
     for image in model.images.values():
         cameras.setdefault(image.name.partition("/")[0], set()).add(image.camera_id)
-    assert all(len(found) == 1 for found in cameras.values())
+    for found in cameras.values():
+        assert len(found) == 1
     return {folder: min(found) for folder, found in cameras.items()}
 
 
@@ -82,7 +85,8 @@ def error_of_centres(model: pycolmap.Reconstruction, phases: dict[str, float]) -
 )
 def test_folders_of_two_lenses_keep_two_cameras_and_one_that_is_added_finds_its_own(tmp_path: Path):
     phases = {"cam0": 0.0, "cam1": 0.04}
-    source, out = tmp_path / "photos", tmp_path / "out"
+    source = tmp_path / "photos"
+    out = tmp_path / "out"
     take_photos(source / "cam0", phases["cam0"], WIDTH)
     take_photos(source / "cam1", phases["cam1"], 1.25 * WIDTH)
     assert process(Process(source, out)).registered == 2 * COUNT
@@ -90,7 +94,9 @@ def test_folders_of_two_lenses_keep_two_cameras_and_one_that_is_added_finds_its_
     cameras = camera_of_folders(before)
     assert len(set(cameras.values())) == 2
     for folder, factor in (("cam0", 1), ("cam1", 1.25)):
-        assert before.cameras[cameras[folder]].mean_focal_length() == pytest.approx(factor * WIDTH, rel=0.02)
+        actual = before.cameras[cameras[folder]].mean_focal_length()
+        expected = pytest.approx(factor * WIDTH, rel=0.02)
+        assert actual == expected
     assert error_of_centres(before, phases) < 0.03
 
     take_photos(source / "cam2", 0.08, 1.25 * WIDTH)
@@ -103,13 +109,16 @@ def test_folders_of_two_lenses_keep_two_cameras_and_one_that_is_added_finds_its_
 
 
 def test_folders_of_one_lens_have_one_camera_to_which_photos_are_added(tmp_path: Path):
-    source, out, later = tmp_path / "photos", tmp_path / "out", tmp_path / "later"
+    source = tmp_path / "photos"
+    out = tmp_path / "out"
+    later = tmp_path / "later"
     take_photos(source / "cam0", 0.0, WIDTH)
     take_photos(source / "cam1", 0.04, WIDTH)
     take_photos(later, 0.06, WIDTH)
     assert process(Process(source, out)).registered == 2 * COUNT
     before = pycolmap.Reconstruction(out / "work" / "model")
-    assert len(before.cameras) == len(before.rigs) == 1 and before.is_valid()
+    assert len(before.cameras) == len(before.rigs) == 1
+    assert before.is_valid()
     (camera,) = before.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDTH, rel=0.02)
     with pycolmap.Database.open(out / "work" / "database.db") as database:
@@ -136,7 +145,9 @@ def cameras_with(focal_lengths: list[tuple[float, float]]) -> pycolmap.Reconstru
 
 def test_cameras_are_the_same_within_one_percent_both_ways():
     model = cameras_with([(100, 100), (100.9, 99.2), (101.1, 100), (100, 98.9)])
-    assert same_cameras(model, [["1", "2", "3", "4"]], set()) == {2: 1}
-    assert same_cameras(model, [["1", "3", "4"], ["2"]], set()) == {}
+    actual = same_cameras(model, [["1", "2", "3", "4"]], set())
+    assert actual == {2: 1}
+    actual = same_cameras(model, [["1", "3", "4"], ["2"]], set())
+    assert actual == {}
     assert same_cameras(model, [["1", "2"]], {2}) == {1: 2}
     assert same_cameras(model, [["1", "2"]], {1, 2}) == {}

@@ -12,7 +12,8 @@ import pytest
 
 from sadgs_ns.placing.judgement import CRITERIA, Judgement, Measures, judge, measure
 
-SIDE, FOCAL_LENGTH = 640, 600.0
+SIDE = 640
+FOCAL_LENGTH = 600.0
 SOUND = Measures(widest=60, narrowest=45, stretch=1.01, observations=500, parallax=15, shift=0.03)
 
 
@@ -82,8 +83,10 @@ def reasons(model: pycolmap.Reconstruction) -> Judgement:
 def test_nothing_speaks_against_cameras_around_an_object():
     measures = measure(model_of(*orbit(12), points_ahead()))
     assert measures.widest == measures.narrowest == pytest.approx(56.14, abs=0.01)
-    assert measures.stretch == 1 and measures.observations == 300
-    assert 40 < measures.parallax < 50 and measures.shift > 0.01
+    assert measures.stretch == 1
+    assert measures.observations == 300
+    assert 40 < measures.parallax < 50
+    assert measures.shift > 0.01
     assert judge(measures) == Judgement([], [])
     assert judge(SOUND).is_sound
 
@@ -111,15 +114,19 @@ def test_nothing_speaks_against_cameras_around_an_object():
 )
 def test_each_measure_beyond_its_limits_is_a_reason(field: str, doubtful: float, wrong: float, reason: str):
     doubt = judge(dataclasses.replace(SOUND, **{field: doubtful}))
-    assert len(doubt.doubts) == 1 and not doubt.faults and not doubt.is_sound
+    assert len(doubt.doubts) == 1
+    assert not doubt.faults
+    assert not doubt.is_sound
     fault = judge(dataclasses.replace(SOUND, **{field: wrong}))
-    assert not fault.doubts and not fault.is_sound
+    assert not fault.doubts
+    assert not fault.is_sound
     with pytest.raises(AssertionError, match=reason):
         raise AssertionError(*fault.faults)
 
 
 def test_every_measure_has_a_criterion():
-    assert [criterion.measure for criterion in CRITERIA] == [field.name for field in dataclasses.fields(Measures)]
+    expected = [field.name for field in dataclasses.fields(Measures)]
+    assert [criterion.measure for criterion in CRITERIA] == expected
 
 
 @pytest.mark.parametrize("focal_lengths", [(131, 131), (78934, 449)])
@@ -138,9 +145,11 @@ def test_the_focal_length_of_a_single_photo_is_not_held_against_all():
 
 def test_few_points_and_none_are_told():
     few = reasons(model_of(*orbit(6), points_ahead(6)))
-    assert few.faults == [few.faults[0]] and "at most 6 points" in few.faults[0]
+    assert few.faults == [few.faults[0]]
+    assert "at most 6 points" in few.faults[0]
     none = reasons(model_of(*orbit(6), points_ahead(0)))
-    assert none.faults == [none.faults[0]] and "at most 0 points" in none.faults[0]
+    assert none.faults == [none.faults[0]]
+    assert "at most 0 points" in none.faults[0]
 
 
 def test_points_far_away_have_hardly_any_parallax():

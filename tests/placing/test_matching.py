@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import shutil
-import sqlite3
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +12,8 @@ import pytest
 import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
+
+from helpers.colmap_database import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -33,27 +33,36 @@ def by_hand(one: np.ndarray, other: np.ndarray) -> set[tuple[int, int]]:
     """Mutual matches, one descriptor after the other."""
 
     def best(of: np.ndarray, among: np.ndarray) -> int:
-        angles = [np.arccos(min(float(of.astype(float) @ x.astype(float)) / 512**2, 1.0)) for x in among]
+        cosines = among.astype(float) @ of.astype(float) / 512**2
+        angles = np.arccos(np.minimum(cosines, 1.0))
         order = np.argsort(angles, kind="stable")
         near = angles[order[0]] <= 0.7 and (len(order) == 1 or angles[order[0]] < 0.8 * angles[order[1]])
         return int(order[0]) if near else -1
 
     if not len(one) or not len(other):
         return set()
-    return {(i, best(x, other)) for i, x in enumerate(one) if (j := best(x, other)) >= 0 and best(other[j], one) == i}
+    matches = set()
+    for i, x in enumerate(one):
+        j = best(x, other)
+        if j >= 0 and best(other[j], one) == i:
+            matches.add((i, j))
+    return matches
 
 
 @pytest.mark.parametrize(("number", "others"), [(40, 60), (1, 5), (7, 1), (0, 3), (3, 0)])
 def test_matches_are_those_of_a_loop_over_all_pairs(matching: ModuleType, number: int, others: int):
     generator = np.random.default_rng(number)
-    one, other = random_descriptors(number, generator), random_descriptors(others, generator)
+    one = random_descriptors(number, generator)
+    other = random_descriptors(others, generator)
     shared = min(number, others) // 2
     noise = generator.integers(-3, 4, (shared, 128))
     other[:shared] = (one[:shared].astype(int) + noise).clip(0, 255)
     if shared > 3:
         other[shared] = other[0]  # Two are as near as each other, so that neither is a match.
     found = matching.match_descriptors(torch.from_numpy(one), torch.from_numpy(other))
-    assert found.shape[1] == 2 and {(i, j) for i, j in found.tolist()} == by_hand(one, other)
+    assert found.shape[1] == 2
+    actual = {(i, j) for i, j in found.tolist()}
+    assert actual == by_hand(one, other)
     assert len(found) >= shared - 1
 
 
@@ -65,15 +74,19 @@ def test_photos_are_paired_with_those_that_look_most_alike(matching: ModuleType)
     photos = [*ring, random_descriptors(60, generator), scene[:0]]
     pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 4)
     near = {(i, j) for i in range(12) for j in range(i + 1, 12) if min(j - i, 12 + i - j) <= 2}
-    assert near <= {*pairs} and len(pairs) == len({*pairs}) <= 4 * len(photos)
-    assert all(i < j for i, j in pairs)
+    assert near <= {*pairs}
+    assert len(pairs) == len({*pairs}) <= 4 * len(photos)
+    for i, j in pairs:
+        assert i < j
 
 
 def test_groups_of_photos_that_hardly_look_alike_are_joined(matching: ModuleType):
     generator = np.random.default_rng(0)
-    one, other = random_descriptors(40, generator), random_descriptors(40, generator)
+    one = random_descriptors(40, generator)
+    other = random_descriptors(40, generator)
     photos = [one] * 4 + [other] * 4
-    photos[2], photos[5] = np.r_[one, other[:1]], np.r_[other, other[:1]]
+    photos[2] = np.r_[one, other[:1]]
+    photos[5] = np.r_[other, other[:1]]
     pairs = matching.similar_pairs([torch.from_numpy(photo) for photo in photos], 3)
     assert any(i < 4 <= j for i, j in pairs)
     assert matching.similar_pairs([torch.zeros(0, 128, dtype=torch.uint8)] * 3, 1)  # as of photos without texture
@@ -97,12 +110,6 @@ def verification_options():
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
-
-
-def rows_of(database: Path, table: str) -> list[tuple]:
-    """All that a table of COLMAP's database holds, byte by byte."""
-    with contextlib.closing(sqlite3.connect(database)) as opened:
-        return opened.execute(f"SELECT * FROM {table} ORDER BY pair_id").fetchall()
 
 
 def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp_path: Path):

@@ -21,7 +21,9 @@ from sadgs_ns.placing.panoramas import VIEWS, cut, is_fisheye_pair, is_panorama,
 from sadgs_ns.placing.photos import read_photos
 from sadgs_ns.placing.reconstruct import choose_pairs
 
-COUNT, HEIGHT, TURN = 12, 256, 0.2
+COUNT = 12
+HEIGHT = 256
+TURN = 0.2
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +39,16 @@ def centres_of(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     for image in model.images.values():
         if "/" in image.name:
             found[image.name.partition("/")[0]].append(image.projection_center())
-    assert all(len(views) == VIEWS and np.ptp(views, axis=0).max() < 1e-9 for views in found.values())
+    for views in found.values():
+        assert len(views) == VIEWS
+        assert np.ptp(views, axis=0).max() < 1e-9
     return {name: views[0] for name, views in sorted(found.items())}
 
 
 def errors_of_centres(model: pycolmap.Reconstruction) -> np.ndarray:
     """Distances of all panoramas from where they are, as shares of the largest from their centre. [COUNT]"""
-    found, expected = np.stack([*centres_of(model).values()]), panorama_centres(COUNT)
+    found = np.stack([*centres_of(model).values()])
+    expected = panorama_centres(COUNT)
     assert len(found) == COUNT
     similarity = pycolmap.estimate_sim3d(found, expected)
     assert similarity is not None
@@ -60,27 +65,33 @@ def errors_of_centres(model: pycolmap.Reconstruction) -> np.ndarray:
     "the panoramas alone are cut, poses that are there stay, and no panorama is divided between training and test",
 )
 def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image], tmp_path: Path, capsys):
-    source, out = tmp_path / "photos", tmp_path / "out"
+    source = tmp_path / "photos"
+    out = tmp_path / "out"
     source.mkdir()
     for i, panorama in enumerate(panoramas):
         panorama.save(source / f"{i:02d}.jpg", quality=95)
     last = shutil.move(source / "11.jpg", tmp_path)
     summary = process(Process(source, out, matching="sequential"))
-    assert (summary.photos, summary.registered) == (11 * VIEWS, 11 * VIEWS)
+    assert summary.photos == 11 * VIEWS
+    assert summary.registered == 11 * VIEWS
     printed = capsys.readouterr().out
     assert "11 of the 11 photos are panoramas: each is cut into 8 views of 90°" in printed
     described = json.loads((out / "transforms.json").read_text())
     assert described["val_filenames"] == described["test_filenames"] == [f"images/04.jpg/{i}.jpg" for i in range(VIEWS)]
-    assert len(described["train_filenames"]) == 10 * VIEWS and len(described["frames"]) == 11 * VIEWS
+    assert len(described["train_filenames"]) == 10 * VIEWS
+    assert len(described["frames"]) == 11 * VIEWS
     for frame in described["frames"]:
-        assert (frame["w"], frame["h"]) == (HEIGHT // 2, HEIGHT // 2)
-        assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [HEIGHT / 4] * 4
+        assert frame["w"] == HEIGHT // 2
+        assert frame["h"] == HEIGHT // 2
+        actual = [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+        assert actual == [HEIGHT / 4] * 4
     shutil.move(last, source)
     middle = panorama_centres(COUNT)[3:9:5]
     for name, centre, rotation in zip(("a.jpg", "b.jpg"), middle, rotations()[1:3], strict=True):
         Image.fromarray(draw_photo(centre + 0.1, rotation, 256)).save(source / name, quality=95)
     summary = process(Process(source, out, matching="exhaustive"))
-    assert (summary.photos, summary.registered) == (COUNT * VIEWS + 2, COUNT * VIEWS + 2)
+    assert summary.photos == COUNT * VIEWS + 2
+    assert summary.registered == COUNT * VIEWS + 2
     assert "12 of the 14 photos are panoramas" in capsys.readouterr().out
     grown = json.loads((out / "transforms.json").read_text())
     frames = {frame["file_path"]: frame for frame in grown["frames"]}
@@ -98,12 +109,15 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
 def test_a_video_of_panoramas_becomes_views(panoramas: list[Image.Image], tmp_path: Path):
     with av.open(str(tmp_path / "film.mp4"), "w") as film:
         stream = film.add_stream("libx264", rate=10, options={"crf": "14"})
-        stream.width, stream.height, stream.pix_fmt = 2 * HEIGHT, HEIGHT, "yuv420p"
+        stream.width = 2 * HEIGHT
+        stream.height = HEIGHT
+        stream.pix_fmt = "yuv420p"
         for panorama in panoramas:
             film.mux(stream.encode(av.VideoFrame.from_image(panorama)))
         film.mux(stream.encode())
     summary = process(Process(tmp_path / "film.mp4", tmp_path / "out"))
-    assert summary.matching == "sequential" and summary.registered >= 0.9 * summary.photos == 0.9 * COUNT * VIEWS
+    assert summary.matching == "sequential"
+    assert summary.registered >= 0.9 * summary.photos == 0.9 * COUNT * VIEWS
     assert errors_of_centres(pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")).max() < 0.01
 
 
@@ -133,7 +147,8 @@ def test_what_is_a_panorama(panoramas: list[Image.Image], tmp_path: Path):
         panorama.resize((1024, 512)).save(tmp_path / f"{i}.jpg", quality=80)
         assert read_photos(tmp_path, [f"{i}.jpg"], lambda *step: None)[0].is_panorama
     told, part = read_photos(tmp_path, ["told.jpg", "wide.jpg"], lambda *step: None)
-    assert told.is_panorama and not part.is_panorama
+    assert told.is_panorama
+    assert not part.is_panorama
 
 
 def fisheye_pair(panorama: Image.Image, radius: float = 0.97, glare: int = 0) -> Image.Image:
@@ -161,7 +176,8 @@ def fisheye_pair(panorama: Image.Image, radius: float = 0.97, glare: int = 0) ->
 def test_pairs_of_fisheye_circles_are_told(panoramas: list[Image.Image], radius: float, glare: int):
     for panorama in panoramas:
         pair = fisheye_pair(panorama, radius, glare)
-        assert is_fisheye_pair(pair, pair.size) and not is_panorama(pair, pair.size)
+        assert is_fisheye_pair(pair, pair.size)
+        assert not is_panorama(pair, pair.size)
 
 
 def test_other_wide_photos_are_no_pairs_of_fisheye_circles(panoramas: list[Image.Image]):
@@ -189,7 +205,8 @@ def test_pairs_of_fisheye_circles_are_refused(panoramas: list[Image.Image], tmp_
     assert main([str(source), str(out)]) == 2
     problem = f"4 of the 5 photos in {source}, such as 0.jpg, show two fisheye circles side by side"
     printed = capsys.readouterr().err
-    assert problem in printed and "stitch them to panoramas of 2:1 with the camera's program" in printed
+    assert problem in printed
+    assert "stitch them to panoramas of 2:1 with the camera's program" in printed
     assert not out.exists()
 
 
@@ -205,7 +222,12 @@ def test_views_are_paired_with_those_of_other_panoramas():
     rigs = [[f"{i}.jpg/{view}.jpg" for view in range(VIEWS)] for i in range(20)]
     names = ["a.jpg", *itertools.chain(*rigs)]
     every = choose_pairs(names, rigs, "exhaustive")
-    assert len(every) == 190 * VIEWS**2 + 20 * VIEWS and all(a.split("/")[0] != b.split("/")[0] for a, b in every)
+    assert len(every) == 190 * VIEWS**2 + 20 * VIEWS
+    for a, b in every:
+        assert a.split("/")[0] != b.split("/")[0]
     some = choose_pairs(names, rigs, "sequential")
-    assert ("0.jpg/0.jpg", "2.jpg/0.jpg") in some and ("0.jpg/0.jpg", "1.jpg/4.jpg") in some
-    assert ("0.jpg/0.jpg", "1.jpg/2.jpg") not in some and ("19.jpg/7.jpg", "a.jpg") in some and len(some) < 16 * 160
+    assert ("0.jpg/0.jpg", "2.jpg/0.jpg") in some
+    assert ("0.jpg/0.jpg", "1.jpg/4.jpg") in some
+    assert ("0.jpg/0.jpg", "1.jpg/2.jpg") not in some
+    assert ("19.jpg/7.jpg", "a.jpg") in some
+    assert len(some) < 16 * 160

@@ -148,7 +148,8 @@ def run(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Run:
     "folders are removed, COLMAP's process is gone",
 )
 def test_an_interrupted_run_ends_in_a_sentence_and_goes_on(run: Run):
-    assert run.exit_code == 143 and run.printed == "sadgs-process: stopped; run the same command again to resume.\n"
+    assert run.exit_code == 143
+    assert run.printed == "sadgs-process: stopped; run the same command again to resume.\n"
     assert run.left - {"database.db-shm", "database.db-wal"} == {"settings.json", "database.db", "alpha"}
     # Few points of such small photos hold them together, so they are placed a second time.
     placing = ["cameras", "cameras (checked)"]
@@ -158,11 +159,15 @@ def test_an_interrupted_run_ends_in_a_sentence_and_goes_on(run: Run):
 
 def test_photos_are_registered_where_they_were_taken(run: Run):
     summary = run.summary
-    assert summary.photos == VIEWS + 1 and summary.registered == VIEWS
-    assert summary.points > 200 and summary.reprojection_error < 0.5
-    assert list(summary.left_out) == ["fog.png"] and "features" in summary.left_out["fog.png"]
+    assert summary.photos == VIEWS + 1
+    assert summary.registered == VIEWS
+    assert summary.points > 200
+    assert summary.reprojection_error < 0.5
+    assert list(summary.left_out) == ["fog.png"]
+    assert "features" in summary.left_out["fog.png"]
     errors = errors_of_centres(run.out, camera_centres())
-    assert np.median(errors) < 0.03 and errors.max() < 0.05
+    assert np.median(errors) < 0.03
+    assert errors.max() < 0.05
 
 
 def test_all_points_and_cameras_are_adjusted_at_the_end(run: Run):
@@ -189,7 +194,8 @@ def errors_of_centres(out: Path, expected: np.ndarray) -> np.ndarray:
     by_name = {image.name: image.projection_center() for image in model.images.values()}
     found = np.stack([by_name[name] for name in sorted(by_name)])
     # Umeyama's similarity between the two sets of centres.
-    found, expected = found - found.mean(0), expected - expected.mean(0)
+    found = found - found.mean(0)
+    expected = expected - expected.mean(0)
     u, s, vt = np.linalg.svd(expected.T @ found)
     sign = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     aligned = (found @ (u @ sign @ vt).T) * (s * np.diag(sign)).sum() / (found**2).sum()
@@ -219,7 +225,8 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     run: Run, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registered: int, stretch: float
 ):
     shutil.copy(run.out / "work" / "database.db", tmp_path)
-    mapping, angles = pycolmap.incremental_mapping, []
+    mapping = pycolmap.incremental_mapping
+    angles = []
 
     def note_the_angle(*arguments: Any, **callbacks: Any) -> Any:
         angles.append(arguments[3].mapper.init_min_tri_angle)
@@ -238,8 +245,10 @@ def test_a_doubtful_model_is_tried_again_and_the_better_one_kept(
     monkeypatch.setattr(reconstruct, "is_firm", lambda model: True)
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
-    (camera,) = (made := pycolmap.Reconstruction(tmp_path / "model")).cameras.values()
-    assert angles == [8, 4] and made.num_reg_images() == VIEWS
+    made = pycolmap.Reconstruction(tmp_path / "model")
+    (camera,) = made.cameras.values()
+    assert angles == [8, 4]
+    assert made.num_reg_images() == VIEWS
     assert camera.focal_length_x == pytest.approx(camera.focal_length_y, rel=0.05)
     told = (tmp_path / "model" / "attempts.txt").read_text()
     assert told == f"A first attempt registered {registered}, one with relaxed limits {VIEWS}."
@@ -280,7 +289,8 @@ def test_photos_that_are_added_are_tried_again_however_many_there_are(
     failing = 4
     with pytest.raises(InputError, match="related to the others: give another output folder, for which all photos"):
         reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "other", base)
-    assert angles == [8, 4, 8, 4] and not (tmp_path / "other").exists()
+    assert angles == [8, 4, 8, 4]
+    assert not (tmp_path / "other").exists()
 
 
 @pytest.mark.hard_case(
@@ -308,7 +318,8 @@ def test_a_wrong_model_ranks_below_one_with_fewer_photos(
     names = sorted(photo.name for photo in photos.iterdir())
     reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     made = pycolmap.Reconstruction(tmp_path / "model")
-    assert attempts == [VIEWS, VIEWS] and made.num_reg_images() == VIEWS - 3
+    assert attempts == [VIEWS, VIEWS]
+    assert made.num_reg_images() == VIEWS - 3
     assert all(camera.mean_focal_length() < 1000 for camera in made.cameras.values())
 
 
@@ -328,13 +339,15 @@ def test_cameras_without_points_are_none(run: Run, photos: Path, tmp_path: Path,
 
 
 def test_the_summary_has_the_reasons_that_speak_against_a_model(run: Run, photos: Path):
-    assert run.summary.doubts == run.summary.faults == [] and not run.summary.is_poor
+    assert run.summary.doubts == run.summary.faults == []
+    assert not run.summary.is_poor
     model = pycolmap.Reconstruction(run.out / "work" / "model")
     for camera in model.cameras.values():
         camera.params = [33, 45, *camera.params[2:]]
     names = sorted(photo.name for photo in photos.iterdir())
     summary = reconstruct.summarize(names, model, run.out / "work" / "database.db", "exhaustive", "")
-    assert summary.is_poor and summary.registered == VIEWS
+    assert summary.is_poor
+    assert summary.registered == VIEWS
     assert summary.faults[0].startswith("they would see 135° across, more than a lens does: ")
     assert summary.doubts[0].startswith("their focal lengths across and down would differ by a factor of 1.4: ")
 
@@ -372,8 +385,11 @@ OPEN = pytest.mark.filterwarnings("ignore:Exception ignored in. <_io.FileIO:pyte
 @OPEN
 def test_nerfstudio_reads_the_scene_without_options(run: Run, open3d: None):
     parsed = NerfstudioDataParserConfig(data=run.out, load_3D_points=True).setup().get_dataparser_outputs("train")
-    assert 0 < len(parsed.image_filenames) < VIEWS and all(path.exists() for path in parsed.image_filenames)
-    assert len({(int(w), int(h)) for w, h in zip(parsed.cameras.width, parsed.cameras.height, strict=True)}) == 1
+    assert 0 < len(parsed.image_filenames) < VIEWS
+    for path in parsed.image_filenames:
+        assert path.exists()
+    sizes = torch.cat([parsed.cameras.width, parsed.cameras.height], dim=-1)
+    assert len(sizes.unique(dim=0)) == 1
     assert parsed.cameras.distortion_params is None or not parsed.cameras.distortion_params.any()
     assert len(parsed.metadata["points3D_xyz"]) > 200
 
@@ -382,7 +398,8 @@ def test_nerfstudio_reads_the_scene_without_options(run: Run, open3d: None):
 def test_training_reads_the_scene_without_options(run: Run):
     parser = NerfstudioDataParserConfig(data=run.out, load_3D_points=True)
     dataset = SadgsDatamanagerConfig(dataparser=parser).setup(device="cpu").train_dataset
-    assert 0 < len(dataset) < VIEWS and len(dataset.metadata["points3D_xyz"]) > 200
+    assert 0 < len(dataset) < VIEWS
+    assert len(dataset.metadata["points3D_xyz"]) > 200
 
 
 @pytest.mark.hard_case(
@@ -392,14 +409,17 @@ def test_training_reads_the_scene_without_options(run: Run):
 )
 @pytest.mark.hard_case("a scene is finished", "`sadgs-doctor` and `ns-train` are named as next, quoted for the shell")
 def test_a_finished_scene_keeps_what_photos_are_added_to_and_is_known_again(run: Run, photos: Path, capsys):
-    assert {path.name for path in (run.out / "work").iterdir()} == {"settings.json", "database.db", "model"}
+    actual = {path.name for path in (run.out / "work").iterdir()}
+    assert actual == {"settings.json", "database.db", "model"}
     before = {path: path.stat().st_mtime_ns for path in run.out.rglob("*")}
     assert main([str(photos), str(run.out)]) == 0
     printed = capsys.readouterr().out
     assert "a scene is finished; delete it to make it again." in printed
-    assert f"{VIEWS} of {VIEWS + 1} photos registered" in printed and "sadgs-doctor '" in printed
+    assert f"{VIEWS} of {VIEWS + 1} photos registered" in printed
+    assert "sadgs-doctor '" in printed
     assert f"ns-train sadgs --data '{run.out}'" in printed
-    assert before == {path: path.stat().st_mtime_ns for path in run.out.rglob("*")}
+    expected = {path: path.stat().st_mtime_ns for path in run.out.rglob("*")}
+    assert before == expected
     assert main([str(photos), str(run.out), "--max-size", "80"]) == 2
     assert "(--max-size was 1600, is 80); give another folder" in capsys.readouterr().err
 
@@ -422,13 +442,15 @@ def test_sequential_pairs_are_neighbours_and_ever_fewer_farther_on():
     names = [f"{i:03d}" for i in range(40)]
     pairs = sequential_pairs(names, overlap=3)
     steps = {int(b) - int(a) for a, b in pairs}
-    assert steps == {1, 2, 3, 16, 32} and len(pairs) == len(set(pairs)) == 39 + 38 + 37 + 24 + 8
+    assert steps == {1, 2, 3, 16, 32}
+    assert len(pairs) == len(set(pairs)) == 39 + 38 + 37 + 24 + 8
     assert len(pairs) < len(list(itertools.combinations(names, 2))) / 5
 
 
 def test_photos_of_one_size_and_lens_share_a_camera(tmp_path: Path):
     for name, size, focal in (("a", 8, None), ("b", 8, None), ("c", 9, None), ("d", 8, 50.0), ("e", 8, 35.0)):
-        image, exif = Image.new("RGB", (size, 8)), Image.Exif()
+        image = Image.new("RGB", (size, 8))
+        exif = Image.Exif()
         if focal is not None:
             exif.get_ifd(0x8769)[0x920A] = focal
         image.save(tmp_path / f"{name}.jpg", exif=exif)
@@ -456,7 +478,8 @@ def test_bad_photos_are_told_in_a_sentence(tmp_path: Path, prepare, sentence: st
     prepare(tmp_path / "photos")
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
-    assert sentence in printed and printed.count("\n") == 1
+    assert sentence in printed
+    assert printed.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
@@ -534,7 +557,8 @@ def test_photos_that_are_not_read_are_told_beside_those_that_are(
     (folder / "notes.txt").write_text("no image")
     registered(9)
     assert main([str(folder), str(tmp_path / "out")]) == 0
-    assert "9 of 12 photos registered" in (printed := capsys.readouterr().out)
+    printed = capsys.readouterr().out
+    assert "9 of 12 photos registered" in printed
     assert "as images that are not read (make them .jpg or .png files): 8, such as IMG_0.HEIC.\n" in printed
 
 
@@ -566,9 +590,12 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
     link(tmp_path / "i.png")
     assert main([str(tmp_path), str(tmp_path / "out")]) == 2
     printed = capsys.readouterr().err
-    assert "7 of the 9 photos in" in printed and printed.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert "7 of the 9 photos in" in printed
+    assert printed.count("\n") == 1
+    assert not (tmp_path / "out").exists()
     assert all(f"{name} (" in printed for name in ("b.jpg", "c.png", "d.webp", "e.tif", "i.png"))
-    assert "g.jpg (0 bytes), h.jpg (0 bytes)" in printed and "copy them again or remove them" in printed
+    assert "g.jpg (0 bytes), h.jpg (0 bytes)" in printed
+    assert "copy them again or remove them" in printed
     with pytest.raises(InputError, match=r"0\.jpg \(.*, 19\.jpg \(.*\), 5 more; copy"):
         read_photos(tmp_path, [f"{i}.jpg" for i in range(25)], lambda *step: None)
 
@@ -597,7 +624,8 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
 )
 @pytest.mark.hard_case("a folder among the photos that may not be entered", "left out, with a line")
 def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    photos, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    photos = tmp_path / "photos"
+    elsewhere = tmp_path / "elsewhere"
     black(photos, "a.png", "sub/b.png")
     black(elsewhere, "c.png", "sub/d.png", "scene/images/e.png")
     (elsewhere / "scene" / "work").mkdir()
@@ -627,7 +655,8 @@ def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_pat
     link(tmp_path / "out")
     assert main([str(photos), str(tmp_path / "out")]) == 1
     printed = capsys.readouterr().err
-    assert "out" in printed and printed.count("\n") == 1
+    assert "out" in printed
+    assert printed.count("\n") == 1
 
 
 @pytest.mark.hard_case("`--max-size 5`, 63, −5", "refused: at least 64, or 0")
@@ -646,7 +675,8 @@ def test_a_converted_photo_never_replaces_another_one(tmp_path: Path, capsys):
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert main([str(tmp_path), str(tmp_path / "scene")]) == 2
     assert "converted, two photos would be called a.webp.jpg; rename one" in capsys.readouterr().err
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
+    actual = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    assert actual == before
 
 
 @pytest.mark.hard_case("transparent photos", "alpha is kept: the scene's images are RGBA, a line says how many")
@@ -671,7 +701,8 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
         photo.save(tmp_path / "photos" / f"my photo {i}.{suffix}", kind, lossless=kind == "WEBP", quality=98)
     summary = process(Process(tmp_path / "photos", tmp_path / "out", max_size=80))
     assert "2 photos are partly transparent" in capsys.readouterr().out
-    assert summary.registered == 6 and not summary.left_out
+    assert summary.registered == 6
+    assert not summary.left_out
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert len(frames) == 6
     transparent = []
@@ -681,7 +712,8 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
             if image.mode == "RGBA":
                 transparent.append(Path(frame["file_path"]).name)
                 opacity = np.asarray(image.getchannel("A"))
-                assert not opacity[:, :15].any() and (opacity[10:-10, 25:-10] == 255).all()
+                assert not opacity[:, :15].any()
+                assert (opacity[10:-10, 25:-10] == 255).all()
     assert sorted(transparent) == ["my photo 1.jpg.png", "my photo 2.webp.png"]
 
 
@@ -720,25 +752,29 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
     mask.transpose(TURNS[6]).save(tmp_path / "photos" / "masks" / "02.png.png")  # as that photo is stored
     mask.point([value // 255 for value in range(256)]).save(tmp_path / "photos" / "05_mask.png")
     summary = process(Process(tmp_path / "photos", tmp_path / "out"))
-    assert summary.registered == VIEWS and errors_of_centres(tmp_path / "out", camera_centres()).max() < 0.05
+    assert summary.registered == VIEWS
+    assert errors_of_centres(tmp_path / "out", camera_centres()).max() < 0.05
     described = json.loads((tmp_path / "out" / "transforms.json").read_text())
     assert described["w"] > described["h"]
     for name in (frame["file_path"] for frame in described["frames"]):
         with Image.open(tmp_path / "out" / name) as image:
             assert image.getexif().get(0x112, 1) == 1
-            actual, expected = (
-                np.ravel(np.asarray(shown.convert("L").resize((32, 24)))) for shown in (image, drawn[int(name[-6:-4])])
-            )
+            photo = drawn[int(name[-6:-4])]
+            actual = np.ravel(np.asarray(image.convert("L").resize((32, 24))))
+            expected = np.ravel(np.asarray(photo.convert("L").resize((32, 24))))
         assert np.corrcoef(actual, expected)[0, 1] > 0.9
         with Image.open(tmp_path / "out" / "masks" / f"{Path(name).name}.png") as mask:
-            columns, masked = np.asarray(mask), name[-6:-4] in ("00", "02", "05")
-        assert (columns[:, :35] == 255 * (not masked)).all() and (columns[:, 45:-5] == 255).all()
+            columns = np.asarray(mask)
+            masked = name[-6:-4] in ("00", "02", "05")
+        assert (columns[:, :35] == 255 * (not masked)).all()
+        assert (columns[:, 45:-5] == 255).all()
     assert [frame["mask_path"] for frame in described["frames"] if frame["file_path"] == "images/02.png"]
     with pycolmap.Database.open(tmp_path / "out" / "work" / "database.db") as opened:
         keypoints = [opened.read_keypoints(image.image_id) for image in opened.read_all_images()]
     assert sorted(found[:, 0].min() > WIDTH / 4 - 1 for found in keypoints) == [False] * 7 + [True] * 3
     found = check_nerfstudio(tmp_path / "out", ParserOptions())
-    assert {finding.severity for finding in found} == {"note"} and "with 10 masks" in found[-2].sentence, found
+    assert {finding.severity for finding in found} == {"note"}, found
+    assert "with 10 masks" in found[-2].sentence, found
 
 
 @pytest.mark.hard_case(
@@ -748,7 +784,9 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
 def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
     has_masks: bool, tmp_path: Path, registered: Callable[[int], None], monkeypatch: pytest.MonkeyPatch, capsys
 ):
-    source, out, (photo, other) = tmp_path / "photos", tmp_path / "out", itertools.islice(draw_photos(), 2)
+    source = tmp_path / "photos"
+    out = tmp_path / "out"
+    photo, other = itertools.islice(draw_photos(), 2)
     source.mkdir()
     for name, orientation in (("a.jpg", 6), ("b.jpg", 8), ("c.jpg", 3)):
         lying(photo, orientation, source / name)
@@ -808,7 +846,8 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     (tmp_path / "earlier" / "work").mkdir()
     (tmp_path / "earlier" / "work" / "settings.json").write_text("{}")
     found, masks, told = look_into(tmp_path, tmp_path / "out")
-    assert found == sorted(files) and masks == {"images/a.jpg": "images/a_mask.png"}
+    assert found == sorted(files)
+    assert masks == {"images/a.jpg": "images/a_mask.png"}
     assert told == [
         "Left out as thumbnails or trash: 3, such as #recycle/old.jpg.",
         "Left out as depth or other maps: 3, such as Confidence/b.png.",
@@ -817,7 +856,9 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     ]
     (tmp_path / "out" / "work").mkdir(parents=True)
     (tmp_path / "out" / "work" / "settings.json").write_text(json.dumps({"photos": [*left, "images/b.jpg"]}))
-    assert look_into(tmp_path, tmp_path / "out")[0] == sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
+    actual = look_into(tmp_path, tmp_path / "out")[0]
+    expected = sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
+    assert actual == expected
 
 
 @pytest.mark.hard_case(
@@ -868,12 +909,14 @@ def test_damaged_photos_are_copies_of_none(tmp_path: Path, size: float):
         content = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(content[: int(size * len(content))] + name.encode())
     found, masks, _ = look_into(tmp_path, tmp_path / "out")
-    assert found == ["a.jpg", "a.png", "a_mask.png"] and masks == {}
+    assert found == ["a.jpg", "a.png", "a_mask.png"]
+    assert masks == {}
 
 
 @pytest.mark.hard_case("a phone's panorama of a part of the view among the photos", "left out, with a line")
 def test_panoramas_of_a_part_of_the_view_are_left_out(tmp_path: Path):
-    exif, view = Image.Exif(), next(draw_photos())
+    exif = Image.Exif()
+    view = next(draw_photos())
     exif[0x8769] = {0xA401: 6}  # Apple's number of a panorama
     google = b'<rdf:Description GPano:ProjectionType="cylindrical"/>'
     photos: list[tuple[str, tuple[int, int], dict[str, Any]]] = [
@@ -901,12 +944,15 @@ def test_the_brighter_colour_of_a_mask_is_white(bright: tuple[int, int, int], tm
         mask.paste((0, 0, 0), (0, 0, 40 + i, HEIGHT))
         mask.save(tmp_path / "masks" / name)
     found, masks, told = look_into(tmp_path, tmp_path / "out")
-    assert found == [*photos] and masks == {name: f"masks/{name}" for name in photos} and not told
+    assert found == [*photos]
+    assert masks == {name: f"masks/{name}" for name in photos}
+    assert not told
     read = read_photos(tmp_path, found, lambda *step: None)
     write_masks(tmp_path, masks, read, read, tmp_path / "written")
     for i, name in enumerate(photos):
         white = np.asarray(Image.open(tmp_path / "written" / f"{name}.png"))
-        assert not white[:, : 40 + i].any() and (white[:, 40 + i :] == 255).all()
+        assert not white[:, : 40 + i].any()
+        assert (white[:, 40 + i :] == 255).all()
 
 
 @pytest.mark.hard_case("photos' masks in which black is 16, in 8 or 16 bits", "black is hidden")
@@ -918,7 +964,8 @@ def test_a_mask_s_black_need_not_be_0(kind: type, unit: int, tmp_path: Path):
     photo = Photo("a.png", (WIDTH, HEIGHT), (), False)
     for name, num_hiding in (("mask.png", 1), ("white.png", 0)):
         Image.new("L", photo.size, 255).save(tmp_path / "white.png")
-        assert write_masks(tmp_path, {"a.png": name}, [photo], [photo], tmp_path / name[:4]) == num_hiding
+        actual = write_masks(tmp_path, {"a.png": name}, [photo], [photo], tmp_path / name[:4])
+        assert actual == num_hiding
     with Image.open(tmp_path / "mask" / "a.png.png") as mask:
         assert (np.asarray(mask) == np.where(values > 128 * unit, 255, 0)).all()
 
@@ -948,7 +995,9 @@ def test_a_mask_of_a_panorama_is_cut_as_it_is(tmp_path: Path):
     panorama = Photo("pano.png", (256, 128), (), False, is_panorama=True)
     write_masks(tmp_path, {"pano.png": "mask.png"}, [panorama], panorama.views, tmp_path / "masks")
     white = [np.asarray(Image.open(tmp_path / "masks" / f"{view.name}.png")).mean() / 255 for view in panorama.views]
-    assert min(white[:4]) > 0.6 and max(white[4:]) < 0.4 and len(white) == 8
+    assert min(white[:4]) > 0.6
+    assert max(white[4:]) < 0.4
+    assert len(white) == 8
 
 
 @pytest.mark.hard_case("a mask of another shape than its photo", "refused: make it of the whole photo")
@@ -960,7 +1009,8 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str
     told = "masks/b.png has another shape than b.png, whose mask it is by its name: make it of the whole photo, or take"
     assert told in capsys.readouterr().err
     (photos / "masks" / "b.png").unlink()
-    assert main([str(photos), str(tmp_path / "out")]) == 130 and taken == [["a.png", "b.png", "c.png"]]
+    assert main([str(photos), str(tmp_path / "out")]) == 130
+    assert taken == [["a.png", "b.png", "c.png"]]
 
 
 @pytest.mark.hard_case("photos whose names hold spaces or begin with #, on a CPU", "matched as others")
@@ -968,7 +1018,8 @@ def test_names_that_colmap_would_not_read_in_a_list_are_matched_as_others_also_a
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     """In a list of pairs it takes lines that begin with # for comments, and spaces to end names."""
-    names, database = ["#1 2.png", "#3.png", "a 1.png", "b c/a 2.png"], tmp_path / "database.db"
+    names = ["#1 2.png", "#3.png", "a 1.png", "b c/a 2.png"]
+    database = tmp_path / "database.db"
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         noise = np.random.default_rng(0).integers(0, 255, (128, 128, 3), np.uint8)
@@ -991,7 +1042,8 @@ def test_names_that_colmap_would_not_read_in_a_list_are_matched_as_others_also_a
     match(names, database, "exhaustive", None)
     assert names_in_database() == names
     with pycolmap.Database.open(database) as opened:
-        assert opened.num_matched_image_pairs() == 6 and opened.num_verified_image_pairs() == 6
+        assert opened.num_matched_image_pairs() == 6
+        assert opened.num_verified_image_pairs() == 6
 
 
 @pytest.mark.hard_case(
@@ -1089,14 +1141,16 @@ def test_photos_in_cmyk_become_rgb(tmp_path: Path):
 )
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
 def test_photos_with_a_profile_of_other_colors_become_srgb(suffix: str, tmp_path: Path):
-    srgb, swapped = color_profile(swapped=False), color_profile(swapped=True)
+    srgb = color_profile(swapped=False)
+    swapped = color_profile(swapped=True)
     profiles = {"srgb": srgb, "other": swapped, "grey": swapped, "damaged": b"none"}
     names = [f"{name}.{suffix}" for name in profiles]
     for name, content in zip(names, profiles.values(), strict=True):
         image = Image.new("RGB", (16, 16), (200, 40, 10)).convert("L" if name.startswith("grey") else "RGB")
         image.save(tmp_path / name, icc_profile=content)
     folder, _ = convert_photos(tmp_path, read_photos(tmp_path, names, lambda *step: None), tmp_path / "converted")
-    assert [(folder / name).is_symlink() for name in names] == [True, False, True, True]
+    actual = [(folder / name).is_symlink() for name in names]
+    assert actual == [True, False, True, True]
     with Image.open(folder / names[1]) as image:
         assert np.abs(np.array(image)[8, 8].astype(int) - [40, 200, 10]).max() <= 6
         assert image.info.get("icc_profile") != swapped
@@ -1119,13 +1173,19 @@ HEIC = base64.b85decode(  # 64 × 48 px, the left half blue and the right one re
 def test_heic_is_read_as_a_phone_means_it(tmp_path: Path):
     (tmp_path / "IMG_1.HEIC").write_bytes(HEIC)
     names, masks, told = look_into(tmp_path, tmp_path / "out")
-    assert names == ["IMG_1.HEIC"] and not masks and not told
+    assert names == ["IMG_1.HEIC"]
+    assert not masks
+    assert not told
     (photo,) = read_photos(tmp_path, names, lambda *step: None)
-    assert photo.size == (48, 64) and not photo.is_turned and "Phone" in photo.camera
+    assert photo.size == (48, 64)
+    assert not photo.is_turned
+    assert "Phone" in photo.camera
     folder, (converted,) = convert_photos(tmp_path, [photo], tmp_path / "converted")
     assert converted.name == "IMG_1.HEIC.jpg"
     with Image.open(folder / converted.name) as image:
-        assert image.format == "JPEG" and image.size == (48, 64) and image.getexif().get(0x112, 1) == 1
+        assert image.format == "JPEG"
+        assert image.size == (48, 64)
+        assert image.getexif().get(0x112, 1) == 1
         for place, color in {(24, 10): (20, 60, 220), (24, 54): (200, 40, 10)}.items():
             assert np.abs(np.array(image)[place[::-1]].astype(int) - color).max() <= 8
 
@@ -1136,7 +1196,8 @@ def test_heic_is_left_out_without_its_library(tmp_path: Path):
     code = "import sys; sys.modules['pi_heif'] = None; from sadgs_ns.placing.folder import look_into as look; "
     code += "from pathlib import Path; print(look(Path(sys.argv[1]), Path('out')))"
     told = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True, check=True).stdout
-    assert told.startswith("([], {}, ['Left out as images that are not read ") and "1, such as IMG_1.HEIC" in told
+    assert told.startswith("([], {}, ['Left out as images that are not read ")
+    assert "1, such as IMG_1.HEIC" in told
 
 
 @pytest.mark.hard_case("COLMAP aborts", "one sentence with the stage and COLMAP's own words")
@@ -1148,7 +1209,8 @@ def test_an_abort_of_colmap_is_an_error_like_others(tmp_path: Path):
         arguments = tmp_path, [["a.png"]], "exhaustive", 0, model, None, []
         with start_colmap() as colmap:
             make_model(colmap, *arguments, folder=tmp_path, report=lambda stage, *others: steps.append(stage))
-    assert steps == ["features"] and not list(tmp_path.iterdir())
+    assert steps == ["features"]
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.hard_case(
@@ -1164,7 +1226,8 @@ def test_a_full_disk_is_told_in_a_sentence_that_names_the_folder(photos: Path, t
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     printed = capsys.readouterr().err
     assert f"{tmp_path / 'out' / 'work'} could not be written while COLMAP worked on features (" in printed
-    assert "free there): make room, and run the same command again to resume." in printed and printed.count("\n") == 1
+    assert "free there): make room, and run the same command again to resume." in printed
+    assert printed.count("\n") == 1
 
 
 @pytest.fixture
@@ -1193,11 +1256,14 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(
     registered(3)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "sequential"]) == 1
     printed = capsys.readouterr()
-    assert "ns-train" not in printed.out and "3 of 12 photos registered" in printed.out
+    assert "ns-train" not in printed.out
+    assert "3 of 12 photos registered" in printed.out
     told = "out shows only what 3 of 12 photos saw. Try the same command with --matching exhaustive, which uses the "
-    assert printed.err.startswith("warning: ") and told in printed.err
+    assert printed.err.startswith("warning: ")
+    assert told in printed.err
     assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
-    assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    actual = {path.name for path in (tmp_path / "out" / "work").iterdir()}
+    assert actual == {"settings.json", "database.db", "alpha"}
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
     remedy = "photos saw. Try another folder with the photos in their original size, since these are "
     assert remedy in capsys.readouterr().err, "photos of a few px"
@@ -1217,16 +1283,20 @@ def test_wrong_cameras_are_warned_of_and_their_scene_is_not_finished(
     registered(12, faults=["they see too much: zoom in", "they are flat: move"], doubts=["there are few: take more"])
     assert main(command) == 1
     printed = capsys.readouterr()
-    assert "12 of 12 photos registered" in printed.out and "sadgs-doctor" not in printed.out
+    assert "12 of 12 photos registered" in printed.out
+    assert "sadgs-doctor" not in printed.out
     assert "warning: the cameras may be wrong, because there are few: take more.\n" in printed.out
     told = "out are wrong, because they see too much: zoom in; and they are flat: move. Try the same command with "
-    assert printed.err.startswith("warning: the cameras in ") and told in printed.err
+    assert printed.err.startswith("warning: the cameras in ")
+    assert told in printed.err
     assert f"trains on what is there: ns-train sadgs --data {tmp_path / 'out'}\n" in printed.err
-    assert {path.name for path in (tmp_path / "out" / "work").iterdir()} == {"settings.json", "database.db", "alpha"}
+    actual = {path.name for path in (tmp_path / "out" / "work").iterdir()}
+    assert actual == {"settings.json", "database.db", "alpha"}
     registered(12, doubts=["there are few: take more"])
     assert main(command) == 0
     printed = capsys.readouterr()
-    assert "may be wrong, because there are few: take more." in printed.out and "sadgs-doctor" in printed.out
+    assert "may be wrong, because there are few: take more." in printed.out
+    assert "sadgs-doctor" in printed.out
 
 
 def test_the_library_tells_its_caller_and_prints_nothing(
@@ -1235,17 +1305,22 @@ def test_the_library_tells_its_caller_and_prints_nothing(
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     (photos / "a.HEIC").write_bytes(b"a")
     options = PlacingOptions(photos, tmp_path / "out")
-    steps, events = list[tuple[str, int, int]](), list[str]()
+    steps = list[tuple[str, int, int]]()
+    events = list[str]()
 
     def place_again() -> Placed:
         return place_photos(options, lambda *step: steps.append(step), lambda event, sentence: events.append(event))
 
     registered(9)
     placed = place_again()
-    assert placed.summary.registered == 9 and placed.unused[0].endswith(": 1, such as a.HEIC.")
-    assert steps == [("photos", i, 3) for i in (1, 2, 3)] and events == []
+    assert placed.summary.registered == 9
+    assert placed.unused[0].endswith(": 1, such as a.HEIC.")
+    assert steps == [("photos", i, 3) for i in (1, 2, 3)]
+    assert events == []
     (tmp_path / "out" / "transforms.json").write_text("{}")
-    assert place_again() == placed and events == ["unchanged"] and len(steps) == 3
+    assert place_again() == placed
+    assert events == ["unchanged"]
+    assert len(steps) == 3
     for wrong, told in (({"frames": 2}, "--frames must be at least 3"), ({"max_size": 63}, "--max-size must be at l")):
         with pytest.raises(InputError, match=told):
             place_photos(dataclasses.replace(options, **wrong), print, print)
@@ -1270,11 +1345,13 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
 
     def run_another(colmap: Worker, *arguments: object, folder: Path, **others: object) -> None:
         (folder / "models").mkdir()
-        assert main(command) == 2 and (folder / "models").is_dir()
+        assert main(command) == 2
+        assert (folder / "models").is_dir()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sadgs_ns.placing.place.make_model", run_another)
-    assert main(command) == 130 and not (tmp_path / "out" / "work" / "models").exists()
+    assert main(command) == 130
+    assert not (tmp_path / "out" / "work" / "models").exists()
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
 
 
@@ -1301,7 +1378,8 @@ def test_a_model_that_colmap_could_not_write_is_told(run: Run, tmp_path: Path, n
 def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path, taken: list[list[str]]):
     (tmp_path / "out" / "work").mkdir(parents=True)
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
-    assert main([str(photos), str(tmp_path / "out")]) == 130 and len(taken) == 1
+    assert main([str(photos), str(tmp_path / "out")]) == 130
+    assert len(taken) == 1
 
 
 @pytest.mark.hard_case("a damaged `work/settings.json`", "one sentence names it: delete the folder and begin again")
@@ -1310,7 +1388,16 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "out" / "work").mkdir(parents=True)
     (tmp_path / "out" / "work" / "settings.json").write_text('{"source": ')
     assert main([str(photos), str(tmp_path / "out")]) == 2
-    assert "settings.json is damaged (" in (printed := capsys.readouterr().err) and printed.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "settings.json is damaged (" in printed
+    assert printed.count("\n") == 1
+
+
+def imported_by(statement: str) -> set[str]:
+    """Names of the modules that a new process has imported after a statement."""
+    code = f"import sys; {statement}; print(*sys.modules)"
+    process = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return set(process.stdout.split())
 
 
 @pytest.mark.hard_case(
@@ -1319,14 +1406,11 @@ def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
 )
 def test_the_command_starts_without_slow_or_harmful_imports():
     """pycolmap replaces Pillow's zlib, which crashes Pillow where it is loaded later and writes a PNG."""
-    imports = "import sys; from sadgs_ns.cli import process"
-    code = f"{imports}; assert not {{'pycolmap', 'scipy', 'torch'}} & {{*sys.modules}}"
-    subprocess.run([sys.executable, "-c", code], check=True)
+    assert not {"pycolmap", "scipy", "torch"} & imported_by("from sadgs_ns.cli import process")
 
 
 def test_features_are_found_while_torch_is_imported():
-    imports = "import sys; from sadgs_ns.placing import reconstruct"
-    subprocess.run([sys.executable, "-c", f"{imports}; assert 'torch' not in sys.modules"], check=True)
+    assert "torch" not in imported_by("from sadgs_ns.placing import reconstruct")
 
 
 def test_a_gpu_s_matches_are_verified_with_the_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -1388,7 +1472,9 @@ def record(path: Path, codec: str, kind: str, levels: Sequence[int], options: di
     pipe = Pipe()
     with av.open(pipe, "w", format=kind, options=options or {}) as container:
         stream: Any = container.add_stream(codec, rate=10)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        stream.width = 48
+        stream.height = 32
+        stream.pix_fmt = "yuv420p"
         for level in levels:
             pixels = np.full((32, 48, 3), level, np.uint8)
             pixels[:16, :24] = (200, 0, 0)
@@ -1428,7 +1514,8 @@ def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner:
     def header(a: int, b: int, c: int, d: int) -> bytes:
         return struct.pack(">9i", a << 16, b << 16, 0, c << 16, d << 16, 0, 0, 0, 1 << 30)
 
-    content, unturned = film.read_bytes(), header(1, 0, 0, 1)
+    content = film.read_bytes()
+    unturned = header(1, 0, 0, 1)
     start = content.index(unturned, content.index(b"tkhd"))
     film.write_bytes(content[:start] + header(*matrix) + content[start + len(unturned) :])
     (_, frame), *_ = video_frames(film, [], 3)
@@ -1444,7 +1531,9 @@ def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner:
 def test_frames_of_an_interlaced_film_are_no_combs(tmp_path: Path):
     with av.open(str(tmp_path / "film.mts"), "w", format="mpegts") as container:
         stream: Any = container.add_stream("libx264", rate=25, options={"x264opts": "interlaced=1:tff=1"})
-        stream.width, stream.height, stream.pix_fmt = 128, 64, "yuv420p"
+        stream.width = 128
+        stream.height = 64
+        stream.pix_fmt = "yuv420p"
         for i in range(8):
             pixels = np.full((64, 128, 3), 40, np.uint8)
             pixels[::2, 10 * i : 10 * i + 40] = pixels[1::2, 10 * i + 5 : 10 * i + 45] = 220  # half a frame later
@@ -1463,17 +1552,22 @@ def test_frames_of_a_film_in_hdr_are_not_pale(transfer: int, white: float, tmp_p
     pixels[:, 24:] = round(white * 65535)
     with av.open(str(tmp_path / "film.mp4"), "w") as container:
         stream: Any = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p10le"
+        stream.width = 48
+        stream.height = 32
+        stream.pix_fmt = "yuv420p10le"
         context = stream.codec_context
         context.color_primaries = context.colorspace = 9  # BT.2020
-        context.color_trc, context.color_range = transfer, 1
+        context.color_trc = transfer
+        context.color_range = 1
         for _ in range(3):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="gray16le")))
         container.mux(stream.encode())
     frames = [frame for _, frame in video_frames(tmp_path / "film.mp4", [], 3)]
     assert len(frames) == 3
     for frame in frames:
-        assert frame.shape == (32, 48, 3) and frame[:, :20].max() < 12 and frame[:, 28:].min() > 240
+        assert frame.shape == (32, 48, 3)
+        assert frame[:, :20].max() < 12
+        assert frame[:, 28:].min() > 240
 
 
 @pytest.mark.hard_case(
@@ -1487,10 +1581,12 @@ def test_a_folder_of_films_gives_frames_of_each(tmp_path: Path, taken: list[list
         (folder / name).parent.mkdir(exist_ok=True)
         record(folder / name, "libvpx", "matroska", range(0, 10 * length, 10))
     command = [str(folder), str(tmp_path / "out"), "--frames", "9"]
-    assert main(command) == main(command) == 130 and taken[0] == taken[1]
-    assert taken[0] == [f"a.mkv/{i:05d}.jpg" for i in range(5)] + ["a.webm/00000.jpg", "a.webm/00001.jpg"] + [
-        "day/b.webm/00000.jpg"
-    ]
+    assert main(command) == main(command) == 130
+    assert taken[0] == taken[1]
+    expected = (
+        [f"a.mkv/{i:05d}.jpg" for i in range(5)] + ["a.webm/00000.jpg", "a.webm/00001.jpg"] + ["day/b.webm/00000.jpg"]
+    )
+    assert taken[0] == expected
     told = ["Its photos (1, such as still.png) are not used: fewer than 3."]
     assert find_source(folder, tmp_path / "out")[3] == told
     assert "Frames of 3 videos are taken, each with a camera of its own" in capsys.readouterr().out
@@ -1553,7 +1649,8 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     runs: list[list[str]] = []
 
     def stop(colmap: Worker, photos: Path, groups: list[list[str]], *others: object, **named: object) -> None:
-        assert all((photos / name).is_file() for name in itertools.chain(*groups))
+        for name in itertools.chain(*groups):
+            assert (photos / name).is_file()
         runs.append(sorted(itertools.chain(*groups)))
         raise KeyboardInterrupt
 
@@ -1570,10 +1667,13 @@ def test_a_film_whose_frames_were_being_written_goes_on(tmp_path: Path, monkeypa
 
     with monkeypatch.context() as patched:
         patched.setattr("sadgs_ns.placing.video.sharpest_frames", interrupted)
-        assert main(command) == 130 and not list((tmp_path / "out").rglob("*.jpg"))
-    assert main(command) == 130 and taken == [[f"{i:05d}.jpg" for i in range(6)]]
+        assert main(command) == 130
+        assert not list((tmp_path / "out").rglob("*.jpg"))
+    assert main(command) == 130
+    assert taken == [[f"{i:05d}.jpg" for i in range(6)]]
     monkeypatch.setattr(place, "video_frames", None)  # a third run reads none again
-    assert main(command) == 130 and taken[0] == taken[1]
+    assert main(command) == 130
+    assert taken[0] == taken[1]
 
 
 @pytest.mark.hard_case(
@@ -1589,20 +1689,26 @@ def test_a_frame_that_could_not_be_written_is_told_and_made_again(tmp_path: Path
         patched.setattr(Path, "write_bytes", full)
         assert main(command) == 1
     told = capsys.readouterr().err
-    assert "00000.jpg could not be written (No space left on device; " in told and told.count("\n") == 1
-    assert main(command) == 130 and len(taken[0]) == 6
+    assert "00000.jpg could not be written (No space left on device; " in told
+    assert told.count("\n") == 1
+    assert main(command) == 130
+    assert len(taken[0]) == 6
 
 
 @pytest.mark.hard_case("a video that was replaced by another of its name", "refused, as a photo is")
 def test_another_number_of_frames_or_another_film_is_another_scene(tmp_path: Path, taken: list[list[str]], capsys):
     command = [str(film(tmp_path / "film.avi", 8)), str(tmp_path / "out"), "--frames"]
-    assert main([*command, "4"]) == 130 and len(taken[0]) == 4
-    assert main([*command, "8"]) == 2 and len(taken) == 1
+    assert main([*command, "4"]) == 130
+    assert len(taken[0]) == 4
+    assert main([*command, "8"]) == 2
+    assert len(taken) == 1
     printed = capsys.readouterr().err
     assert "with other photos or settings (--frames was 4, is 8); give another folder or delete it." in printed
-    assert main([*command, "4"]) == 130 and taken[0] == taken[1]
+    assert main([*command, "4"]) == 130
+    assert taken[0] == taken[1]
     film(tmp_path / "film.avi", 9)
-    assert main([*command, "4"]) == 2 and len(taken) == 2
+    assert main([*command, "4"]) == 2
+    assert len(taken) == 2
     assert "settings (videos changed: 1, such as film.avi); put these videos back, give" in capsys.readouterr().err
 
 
@@ -1616,7 +1722,8 @@ def test_photos_added_or_removed_while_it_is_not_finished_make_another_scene(
     (photos / "b.png").unlink()
     black(photos, "day/c.png", "day/b.png")
     capsys.readouterr()
-    assert main(command) == 2 and len(taken) == 2
+    assert main(command) == 2
+    assert len(taken) == 2
     changes = "photos added: 2, such as day/b.png; photos removed: 1, such as b.png"
     assert f"settings ({changes}); put these photos back, give another folder or delete it." in capsys.readouterr().err
     other = black(tmp_path / "other", "a.png", "b.png", "c.png")
@@ -1631,7 +1738,8 @@ LATER = [f"{i:02d}.png" for i in (0, 4, 9)]
 def seven(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder for `grown`, and in `before` what it begins with: photos and their scene, without three of them."""
     folder = tmp_path_factory.mktemp("grown")
-    source, out = folder / "now" / "photos", folder / "now" / "out"
+    source = folder / "now" / "photos"
+    out = folder / "now" / "out"
     source.mkdir(parents=True)
     for path in photos.glob("[0-9]*.png"):
         if path.name not in LATER:
@@ -1661,7 +1769,8 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     source, out, before = grown
     before |= {"dataparser_scale": 2.0, "test_filenames": ["images/01.png"]}  # A run may have noted these.
     (out / "transforms.json").write_text(json.dumps(before))
-    model, images = out / "work" / "model", {path.name: path.stat() for path in (out / "images").iterdir()}
+    model = out / "work" / "model"
+    images = {path.name: path.stat() for path in (out / "images").iterdir()}
     old = pycolmap.Reconstruction(model)
     stages: list[str] = []
 
@@ -1673,23 +1782,30 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     with pytest.MonkeyPatch.context() as patched:
         spy_on_stages(patched, stop)
         assert main([str(source), str(out), "--max-size", "120"]) == 143
-        assert json.loads((out / "transforms.json").read_text()) == before and model.is_dir()
+        assert json.loads((out / "transforms.json").read_text()) == before
+        assert model.is_dir()
         assert main([str(source), str(out), "--max-size", "120"]) == 0
     printed = capsys.readouterr().out
     assert "3 photos added to 7.\n" in printed
     assert f"{VIEWS} of {VIEWS} photos registered" in printed
     described = json.loads((out / "transforms.json").read_text())
     frames = {frame["file_path"]: frame for frame in described["frames"]}
-    assert len(frames) == VIEWS and all(frames[frame["file_path"]] == frame for frame in before["frames"])
+    assert len(frames) == VIEWS
+    for frame in before["frames"]:
+        assert frames[frame["file_path"]] == frame
     assert described | {"frames": before["frames"]} == before
     new = pycolmap.Reconstruction(out / "work" / "model-10")
     for identity, image in old.images.items():
         assert (new.images[identity].cam_from_world().matrix() == image.cam_from_world().matrix()).all()
         now = (out / "images" / image.name).stat()
-        assert (now.st_ino, now.st_mtime_ns) == (images[image.name].st_ino, images[image.name].st_mtime_ns)
-    assert (new.cameras[1].params == old.cameras[1].params).all() and len(new.cameras) == 1
-    assert new.num_points3D() > old.num_points3D() and errors_of_centres(out, camera_centres()).max() < 0.05
-    assert {path.name for path in (out / "work").iterdir()} == {"settings.json", "database.db", "model-10"}
+        assert now.st_ino == images[image.name].st_ino
+        assert now.st_mtime_ns == images[image.name].st_mtime_ns
+    assert (new.cameras[1].params == old.cameras[1].params).all()
+    assert len(new.cameras) == 1
+    assert new.num_points3D() > old.num_points3D()
+    assert errors_of_centres(out, camera_centres()).max() < 0.05
+    actual = {path.name for path in (out / "work").iterdir()}
+    assert actual == {"settings.json", "database.db", "model-10"}
     assert Scene(Process(source, out, max_size=120)).added == 0
 
 
@@ -1704,7 +1820,9 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     described = json.loads((out / "transforms.json").read_text())
     widths = {frame["file_path"]: frame["w"] for frame in described["frames"]}
     # Without distortion, an image can be a column narrower than its photo.
-    assert "w" not in described and widths.pop("images/09.png") in (119, 120) and set(widths.values()) == {before["w"]}
+    assert "w" not in described
+    assert widths.pop("images/09.png") in (119, 120)
+    assert set(widths.values()) == {before["w"]}
 
 
 @pytest.mark.hard_case(
@@ -1748,7 +1866,8 @@ def test_photos_are_added_only_where_the_others_are_as_they_were(grown: tuple[Pa
 )
 def test_other_masks_make_another_scene(tmp_path: Path, registered: Callable[[int], None], capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png", "masks/a.png")
-    mask, command = photos / "masks" / "a.png", [str(photos), str(tmp_path / "out")]
+    mask = photos / "masks" / "a.png"
+    command = [str(photos), str(tmp_path / "out")]
     registered(9)
     assert main(command) == 0
     (tmp_path / "out" / "transforms.json").write_text("{}")
@@ -1789,7 +1908,8 @@ def test_an_unreadable_photo_can_be_removed(tmp_path: Path, taken: list[list[str
     command = [str(photos), str(tmp_path / "out")]
     assert main(command) == 2
     (photos / "d.png").unlink()
-    assert main(command) == 130 and taken == [["a.png", "b.png", "c.png"]]
+    assert main(command) == 130
+    assert taken == [["a.png", "b.png", "c.png"]]
 
 
 def test_a_scene_among_its_photos_is_none_of_them(tmp_path: Path, monkeypatch, taken: list[list[str]]):
@@ -1797,7 +1917,8 @@ def test_a_scene_among_its_photos_is_none_of_them(tmp_path: Path, monkeypatch, t
     monkeypatch.chdir(tmp_path)
     assert main([".", "scene"]) == 130
     black(tmp_path / "scene", "images/a.png", "work/undistorted/images/a.png")
-    assert main([".", "scene"]) == 130 and taken == [["a.png", "b.png", "scenery/c.png"]] * 2
+    assert main([".", "scene"]) == 130
+    assert taken == [["a.png", "b.png", "scenery/c.png"]] * 2
 
 
 @pytest.mark.hard_case(
@@ -1818,5 +1939,6 @@ def test_pictures_of_nested_repositories_and_results_are_no_photos(tmp_path: Pat
     (tmp_path / ".git").mkdir()  # of the photos themselves
     for scene, number in ((tmp_path / "out", 4), (tmp_path / "room-splat" / "scene", 3)):
         photos, masks, others = look_into(tmp_path, scene)
-        assert photos == sorted(own) and not masks
+        assert photos == sorted(own)
+        assert not masks
         assert others == [f"Left out as repositories or results of other work: {number}, such as code."]

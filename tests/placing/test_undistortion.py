@@ -14,7 +14,8 @@ from helpers.drawn_textures import energy, photograph, psnr
 from sadgs_ns.placing import undistortion
 from sadgs_ns.placing.undistortion import read_pixels, warp_of, without_distortion, write_image
 
-WIDTH, HEIGHT = 360, 240
+WIDTH = 360
+HEIGHT = 240
 
 
 def lens(k1: float = -0.12, width: int = WIDTH, height: int = HEIGHT) -> pycolmap.Camera:
@@ -48,7 +49,8 @@ def test_a_step_overshoots_little():
     warp = warp_of(camera, pycolmap.UndistortCameraOptions())
     assert warp is not None
     image = warp(photo).astype(int)
-    assert image.min() >= 60 - 13 and image.max() <= 190 + 13, "a tenth of the step"
+    assert image.min() >= 60 - 13, "a tenth of the step"
+    assert image.max() <= 190 + 13, "a tenth of the step"
 
 
 def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
@@ -65,7 +67,8 @@ def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
     image = warp(photo)[..., 0].astype(float)
     at_y, at_x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     found = np.array([(at_x * image).sum(), (at_y * image).sum()]) / image.sum()
-    np.testing.assert_allclose(found, np.asarray(undistorted.img_from_cam(ray))[0], atol=0.05)
+    expected = np.asarray(undistorted.img_from_cam(ray))[0]
+    np.testing.assert_allclose(found, expected, atol=0.05)
 
 
 def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -160,11 +163,14 @@ def test_keypoints_of_the_model_move_with_the_images():
     made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     new = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     model = without_distortion(made, {1: new})
-    assert model.cameras[1].model_name == "PINHOLE" and made.cameras[1].model_name == "OPENCV"
+    assert model.cameras[1].model_name == "PINHOLE"
+    assert made.cameras[1].model_name == "OPENCV"
     rays = np.c_[np.asarray(camera.cam_from_img(points))[:, :2], np.ones(2)]
     expected = np.asarray(new.img_from_cam(rays))
-    np.testing.assert_allclose([point.xy for point in model.images[1].points2D], expected, atol=1e-9)
-    np.testing.assert_allclose([point.xy for point in made.images[1].points2D], points)
+    actual = [point.xy for point in model.images[1].points2D]
+    np.testing.assert_allclose(actual, expected, atol=1e-9)
+    actual = [point.xy for point in made.images[1].points2D]
+    np.testing.assert_allclose(actual, points)
 
 
 def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):

@@ -13,7 +13,8 @@ from av.video.reformatter import Colorspace
 from sadgs_ns.placing.video import video_frames
 
 RED = (200, 30, 30)
-BT_709, BT_601 = Colorspace.ITU709, Colorspace.ITU601
+BT_709 = Colorspace.ITU709
+BT_601 = Colorspace.ITU601
 UNTAGGED = 2
 
 
@@ -22,7 +23,9 @@ def record(file: Path, size: tuple[int, int], matrix: Colorspace, tag: int) -> P
     width, height = size
     with av.open(str(file), "w") as container:
         stream: Any = container.add_stream("libx264", rate=10, options={"crf": "1", "preset": "ultrafast"})
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.width = width
+        stream.height = height
+        stream.pix_fmt = "yuv420p"
         stream.codec_context.colorspace = tag
         drawn = av.VideoFrame.from_ndarray(np.full((height, width, 3), RED, np.uint8), format="rgb24")
         for _ in range(3):
@@ -63,7 +66,9 @@ def test_a_film_has_the_colours_that_its_tag_or_size_tells(
 def test_an_untagged_film_in_rgb_keeps_its_values(tmp_path: Path):
     with av.open(str(tmp_path / "film.avi"), "w") as container:
         stream: Any = container.add_stream("png", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 1280, 720, "rgb24"
+        stream.width = 1280
+        stream.height = 720
+        stream.pix_fmt = "rgb24"
         for _ in range(3):
             drawn = av.VideoFrame.from_ndarray(np.full((720, 1280, 3), RED, np.uint8), format="rgb24")
             container.mux(stream.encode(drawn))

@@ -34,7 +34,8 @@ def drawn_by(
 ) -> dict[str, Tensor]:
     """Images, absolute and plain gradients of a random scene, and what was drawn, in float64 on the CPU."""
     values = {name: value.to(device, dtype) for name, value in random_scene(800, size, seed=0).items()}
-    viewmats, Ks = values["viewmats"].repeat(views, 1, 1), values["Ks"].repeat(views, 1, 1)
+    viewmats = values["viewmats"].repeat(views, 1, 1)
+    Ks = values["Ks"].repeat(views, 1, 1)
     viewmats[-1, 0, 3] = 0.4
     viewmats.requires_grad_(pose)
     leaves = {name: values[name].clone().requires_grad_() for name in ("means", "quats", "scales", "opacities")}
@@ -69,14 +70,15 @@ def drawn_by(
 def test_it_draws_what_the_torch_backend_draws(case: str, per_axis_radii: bool, monkeypatch: pytest.MonkeyPatch):
     options, views = CASES[case]
     stub_gsplat(monkeypatch, per_axis_radii)
-    ours, expected = (
-        drawn_by(module, options, views, 40, "cpu", torch.float64, pose=True)
-        for module in (backend_gsplat, backend_torch)
-    )
-    assert torch.equal(ours.pop("visible"), seen := expected.pop("visible")) and seen.any()
+    ours = drawn_by(backend_gsplat, options, views, 40, "cpu", torch.float64, pose=True)
+    expected = drawn_by(backend_torch, options, views, 40, "cpu", torch.float64, pose=True)
+    seen = expected.pop("visible")
+    assert seen.any()
+    assert torch.equal(ours.pop("visible"), seen)
     if case in ("off the axis", "near plane"):
         assert not seen.all()
-    assert ours.keys() == expected.keys() and "gradient of translations" in ours
+    assert ours.keys() == expected.keys()
+    assert "gradient of translations" in ours
     for name, value in expected.items():
         torch.testing.assert_close(ours[name], value, rtol=1e-9, atol=1e-12, msg=name)
 
@@ -87,9 +89,8 @@ def test_it_draws_what_the_triton_backend_draws(case: str, monkeypatch: pytest.M
     backend_triton = pytest.importorskip("sadgs_ns.render.backend_triton", reason="Triton is not installed")
     monkeypatch.setattr(backend_gsplat, "TILE_SIZE", kernels.TILE_SIZE)  # gsplat 1.4 cuts off at borders of tiles
     options, views = CASES[case]
-    theirs, ours = (
-        drawn_by(module, options, views, 128, "cuda", torch.float32) for module in (backend_gsplat, backend_triton)
-    )
+    theirs = drawn_by(backend_gsplat, options, views, 128, "cuda", torch.float32)
+    ours = drawn_by(backend_triton, options, views, 128, "cuda", torch.float32)
     assert (ours.pop("visible") != theirs.pop("visible")).sum() <= 3
     assert ours.keys() == theirs.keys()
     for name, expected in theirs.items():
@@ -128,9 +129,11 @@ def test_the_triton_backend_takes_coefficients_in_one_tensor(of_each_view: bool,
     scene = {name: value.float() for name, value in random_scene(40, 16, seed=0).items()}
     pytest.importorskip("triton", reason="Triton is not installed")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    means, quats, scales, opacities, colors = (
-        scene[name].to(device) for name in ("means", "quats", "scales", "opacities", "colors")
-    )
+    means = scene["means"].to(device)
+    quats = scene["quats"].to(device)
+    scales = scene["scales"].to(device)
+    opacities = scene["opacities"].to(device)
+    colors = scene["colors"].to(device)
     cameras = Cameras(scene["viewmats"].to(device), scene["Ks"].to(device), 16, 16)
     one_tensor = colors[None] if of_each_view else colors
     images = []

@@ -22,7 +22,8 @@ def look_from(angle: float, distance: float) -> Tensor:
     """World-to-camera transform [1, 4, 4] of a camera that looks at the origin."""
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[0, 0] = viewmat[2, 2] = math.cos(angle)
-    viewmat[0, 2], viewmat[2, 0] = math.sin(angle), -math.sin(angle)
+    viewmat[0, 2] = math.sin(angle)
+    viewmat[2, 0] = -math.sin(angle)
     viewmat[2, 3] = distance
     return viewmat[None]
 
@@ -62,8 +63,10 @@ def render(scene: dict[str, Any], **changes: Any) -> tuple[Tensor, Tensor, dict[
 
 def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool) -> dict[str, Any] | None:
     """Projection of one Gaussian by the first camera, or None if it is culled."""
-    quat, scale = scene["quats"][index].numpy(), scene["scales"][index].numpy()
-    viewmat, K = scene["viewmats"][0].numpy(), scene["Ks"][0].numpy()
+    quat = scene["quats"][index].numpy()
+    scale = scene["scales"][index].numpy()
+    viewmat = scene["viewmats"][0].numpy()
+    K = scene["Ks"][0].numpy()
     size = np.array([scene["width"], scene["height"]])
     w, x, y, z = quat / np.linalg.norm(quat)
     rotation = np.array(
@@ -76,7 +79,8 @@ def reference_gaussian(scene: dict[str, Any], index: int, per_axis: bool) -> dic
     center = viewmat[:3, :3] @ scene["means"][index].numpy() + viewmat[:3, 3]
     if center[2] < NEAR:
         return None
-    focal, principal = K.diagonal()[:2], K[:2, 2]
+    focal = K.diagonal()[:2]
+    principal = K[:2, 2]
     slopes = center[:2] / center[2]
     margin = 0.15 * size / focal
     clamped = np.clip(slopes, -principal / focal - margin, (size - principal) / focal + margin)
@@ -144,12 +148,16 @@ def test_agrees_with_the_reference(per_axis: bool) -> None:
     expected_colors, expected_alphas = reference_render(scene, per_axis=per_axis)
     expected_colors[..., 3:] /= np.maximum(expected_alphas, 1e-10)
     assert colors.dtype == torch.float64
-    np.testing.assert_allclose(colors[0].numpy(), expected_colors, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(alphas[0].numpy(), expected_alphas, rtol=0, atol=1e-12)
+    actual = colors[0].numpy()
+    np.testing.assert_allclose(actual, expected_colors, rtol=0, atol=1e-12)
+    actual = alphas[0].numpy()
+    np.testing.assert_allclose(actual, expected_alphas, rtol=0, atol=1e-12)
     for index in range(len(scene["means"])):
         one = reference_gaussian(scene, index, per_axis)
         radii = np.zeros(2) if one is None else one["radii"]
-        assert info["radii"][0, index].tolist() == (radii.tolist() if per_axis else radii[0])
+        actual = info["radii"][0, index].tolist()
+        expected = radii.tolist() if per_axis else radii[0]
+        assert actual == (expected)
     # The scene reaches the cut-offs: pixels that are done, and Gaussians that are culled.
     assert alphas.max() > 0.999
     assert (info["radii"] == 0).any()
@@ -160,7 +168,8 @@ def test_tile_size(tile_size: int) -> None:
     scene = small_scene()
     colors, _, _ = render(scene, tile_size=tile_size, per_axis_radii=False)
     expected, _ = reference_render(scene, per_axis=False, tile_size=tile_size)
-    np.testing.assert_allclose(colors[0].numpy(), expected[..., :3], rtol=0, atol=1e-12)
+    actual = colors[0].numpy()
+    np.testing.assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-12)
 
 
 def test_spherical_harmonics() -> None:
@@ -176,7 +185,8 @@ def test_spherical_harmonics() -> None:
     expected, _ = reference_render(scene, per_axis=False)
     for given in (coefficients, (coefficients[:, 0], coefficients[:, 1:])):
         colors, _, _ = render(scene, colors=given, sh_degree=1, per_axis_radii=False)
-        np.testing.assert_allclose(colors[0].numpy(), expected[..., :3], rtol=0, atol=1e-10)
+        actual = colors[0].numpy()
+        np.testing.assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-10)
 
 
 @pytest.mark.usefixtures("segment")
@@ -204,11 +214,14 @@ def pixel_losses(
     info: dict[str, Any], means2d: Tensor, colors: Tensor, weights: Tensor, width: int, height: int
 ) -> list[Tensor]:
     """The terms of sum(weights * colour^2), pixel by pixel, as functions of means2d [N, 2]."""
-    conics, opacities, radii = info["conics"][0].detach(), info["opacities"][0].detach(), info["radii"][0]
+    conics = info["conics"][0].detach()
+    opacities = info["opacities"][0].detach()
+    radii = info["radii"][0]
     losses = []
     for row, column in np.ndindex(height, width):
         tile = torch.tensor([column // 16, row // 16])
-        transmittance, color = torch.ones((), dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+        transmittance = torch.ones((), dtype=torch.float64)
+        color = torch.zeros(3, dtype=torch.float64)
         for index in info["depths"][0].argsort().tolist():
             low = ((means2d[index] - radii[index]) / 16).floor()
             high = ((means2d[index] + radii[index]) / 16).ceil()
@@ -237,7 +250,8 @@ def test_absgrad_sums_the_absolute_gradients_of_the_pixels() -> None:
     (weights * colors[0].square()).sum().backward()
 
     means2d = info["means2d"][0].detach().requires_grad_()
-    total, absolute = torch.zeros_like(means2d), torch.zeros_like(means2d)
+    total = torch.zeros_like(means2d)
+    absolute = torch.zeros_like(means2d)
     for loss in pixel_losses(info, means2d, scene["colors"], weights, 21, 18):
         if loss.requires_grad:
             (gradient,) = torch.autograd.grad(loss, means2d)
@@ -271,7 +285,8 @@ def test_info_has_keys_and_shapes_of_gsplat(per_axis: bool) -> None:
     numbers = {"width": 37, "height": 29, "n_cameras": 1}
     assert {name: tuple(info[name].shape) for name in shapes} == shapes
     assert {name: info[name] for name in numbers} == numbers
-    assert info["radii"].dtype == torch.int32 and info["flatten_ids"].dim() == 1
+    assert info["radii"].dtype == torch.int32
+    assert info["flatten_ids"].dim() == 1
     assert set(info) == set(shapes) | set(numbers) | {"flatten_ids"}
 
 
@@ -292,15 +307,21 @@ def test_culled_gaussians_get_zero_gradients() -> None:
     # Behind the camera, in the camera plane, off the screen, and beyond the far plane.
     means = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [50.0, 0.0, 1.0], [0.0, 0.0, 2e10]]).requires_grad_()
     scales = torch.full((4, 3), 0.1).requires_grad_()
-    quats, opacities, colors = torch.eye(4), torch.full((4,), 0.8), torch.ones(4, 16, 3)
-    viewmats, Ks = torch.eye(4)[None], torch.tensor([[[20.0, 0, 10], [0, 20.0, 10], [0, 0, 1]]])
+    quats = torch.eye(4)
+    opacities = torch.full((4,), 0.8)
+    colors = torch.ones(4, 16, 3)
+    viewmats = torch.eye(4)[None]
+    Ks = torch.tensor([[[20.0, 0, 10], [0, 20.0, 10], [0, 0, 1]]])
     image, alphas, info = splatted(
         means, quats, scales, opacities, colors, viewmats, Ks, 20, 20, sh_degree=3, absgrad=True
     )
     (image.sum() + alphas.sum()).backward()
-    assert not image.any() and not alphas.any() and not info["radii"].any()
+    assert not image.any()
+    assert not alphas.any()
+    assert not info["radii"].any()
     for gradient in (means.grad, scales.grad, info["means2d"].absgrad):
-        assert gradient is not None and torch.equal(gradient, torch.zeros_like(gradient))
+        assert gradient is not None
+        assert torch.equal(gradient, torch.zeros_like(gradient))
 
 
 def test_no_gaussians() -> None:
@@ -312,9 +333,12 @@ def test_no_gaussians() -> None:
     camera = {name: small_scene()[name] for name in ("viewmats", "Ks", "width", "height")}
     image, alphas, info = render(scene | camera, sh_degree=1, absgrad=True)
     image.sum().backward()
-    assert image.shape == (1, 29, 37, 3) and not image.any() and not alphas.any()
+    assert image.shape == (1, 29, 37, 3)
+    assert not image.any()
+    assert not alphas.any()
     assert info["means2d"].absgrad.shape == (1, 0, 2)
-    assert scene["means"].grad is not None and scene["means"].grad.shape == (0, 3)
+    assert scene["means"].grad is not None
+    assert scene["means"].grad.shape == (0, 3)
 
 
 def test_two_cameras_equal_two_calls() -> None:

@@ -40,7 +40,8 @@ photometric = pytest.importorskip("sadgs_ns.kernels.losses", reason="Triton is n
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 fused_photometric_loss = partial(photometric.photometric_loss, window=losses.WINDOW)
-HEIGHT, WIDTH = 13, 12
+HEIGHT = 13
+WIDTH = 12
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
@@ -107,7 +108,8 @@ def test_the_losss_gradient_by_finite_differences(name: str, ssim_lambda: float)
 def test_the_kernels_loss_and_gradient_equal_the_float64_reference(name: str):
     predicted, target = {**SMOOTH, **KINKED}[name]()
     # Both from the same float32 numbers, so that equal pixels stay equal.
-    predicted, target = predicted.float().to(DEVICE), target.float().to(DEVICE)
+    predicted = predicted.float().to(DEVICE)
+    target = target.float().to(DEVICE)
     results = []
     for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
         x = predicted.to(dtype).requires_grad_()
@@ -133,10 +135,12 @@ def test_the_kernels_loss_and_gradient_equal_the_float64_reference(name: str):
 def test_views_smaller_than_ssims_window_take_the_torch_code(shape: tuple[int, ...], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(kernels, "available", lambda device: True)
     monkeypatch.setattr(photometric, "photometric_loss", None)  # calling it would fail
-    predicted, target = noise(*shape), noise(*shape, seed=1)
+    predicted = noise(*shape)
+    target = noise(*shape, seed=1)
     loss, _ = losses.photometric_loss(predicted.float(), target.float())
     assert torch.autograd.gradcheck(lambda x: losses.photometric_loss(x, target)[0], (predicted.requires_grad_(),))
-    torch.testing.assert_close(loss.double(), losses.photometric_loss(predicted, target)[0].detach(), rtol=1e-5, atol=0)
+    expected = losses.photometric_loss(predicted, target)[0].detach()
+    torch.testing.assert_close(loss.double(), expected, rtol=1e-5, atol=0)
 
 
 @pytest.mark.hard_case("no upstream gradient", "none flows")
@@ -198,7 +202,8 @@ HARD = (opaque, stacked, needle, disc, equal_depths, equal_colours, long_quatern
 
 
 def render_hard(gaussians: dict[str, Any], **options: Any) -> Tensor:
-    dtype, device = gaussians["means"].dtype, gaussians["means"].device
+    dtype = gaussians["means"].dtype
+    device = gaussians["means"].device
     viewmats = torch.eye(4, dtype=dtype, device=device)[None]
     Ks = torch.tensor([[[9.0, 0, 3.1], [0, 9.0, 2.6], [0, 0, 1]]], dtype=dtype, device=device)
     colors, alphas, _ = splatted(**gaussians, viewmats=viewmats, Ks=Ks, width=6, height=5, tile_size=4, **options)
@@ -254,10 +259,14 @@ def test_opacities_of_zero_and_one_have_finite_gradients():
     means = gaussians["means"].requires_grad_()
     image = render_hard({**gaussians, "opacities": torch.sigmoid(logits)}, absgrad=True)
     image.square().sum().backward()
-    assert image.isfinite().all() and (image[..., 3] > 0.9).any()
-    assert logits.grad is not None and means.grad is not None
+    assert image.isfinite().all()
+    assert (image[..., 3] > 0.9).any()
+    assert logits.grad is not None
+    assert means.grad is not None
     assert not logits.grad.any()
-    assert means.grad.isfinite().all() and means.grad[0].any() and not means.grad[[1, 3]].any()
+    assert means.grad.isfinite().all()
+    assert means.grad[0].any()
+    assert not means.grad[[1, 3]].any()
 
 
 # --- the harmonics' kernel ---
@@ -265,7 +274,8 @@ def test_opacities_of_zero_and_one_have_finite_gradients():
 
 def compare_harmonics(degree: int, values: list[Tensor], viewmats: Tensor, drawn: Tensor) -> list[Tensor]:
     """Gradients of the kernel, after comparing them with gsplat's harmonics in float64."""
-    n, views = len(values[0]), len(viewmats)
+    n = len(values[0])
+    views = len(viewmats)
     weights = noise(views, n, 3, seed=9).float() - 0.5
     fast = [value.to(DEVICE, copy=True).requires_grad_() for value in values]
     colors = harmonics.colors_from_harmonics(degree, *fast, viewmats.to(DEVICE), drawn.int().to(DEVICE))
@@ -307,21 +317,24 @@ def test_harmonics_near_and_far(distance: float, n: int):
 def test_harmonics_of_degree_0_alone():
     values = [noise(20, 3).float() - 0.5, noise(20, 3, seed=1).float(), torch.zeros(20, 0, 3)]
     gradients = compare_harmonics(0, values, cameras(1), torch.ones(1, 20, dtype=torch.bool))
-    assert not gradients[0].any() and gradients[1].all()
+    assert not gradients[0].any()
+    assert gradients[1].all()
 
 
 @pytest.mark.hard_case("harmonics whose colours are clamped at black", "equals gsplat's in float64 within 2e-5")
 def test_harmonics_of_colours_clamped_at_black():
     values = [noise(20, 3).float() - 0.5, torch.full((20, 3), -50.0), noise(20, 15, 3).float()]
     gradients = compare_harmonics(3, values, cameras(3), torch.ones(3, 20, dtype=torch.bool))
-    assert not any(gradient.any() for gradient in gradients)
+    for gradient in gradients:
+        assert not gradient.any()
 
 
 @pytest.mark.hard_case("harmonics that no view draws", "equals gsplat's in float64 within 2e-5")
 def test_harmonics_that_no_view_draws():
     values = [noise(20, 3).float() - 0.5, noise(20, 3).float(), noise(20, 15, 3).float()]
     gradients = compare_harmonics(3, values, cameras(2), torch.zeros(2, 20, dtype=torch.bool))
-    assert not any(gradient.any() for gradient in gradients)
+    for gradient in gradients:
+        assert not gradient.any()
 
 
 @pytest.mark.hard_case(
@@ -336,8 +349,12 @@ def test_harmonics_of_a_gaussian_where_the_camera_is_have_finite_gradients():
     colors = harmonics.colors_from_harmonics(3, *fast, torch.eye(4, device=DEVICE)[None], drawn.int())
     colors[drawn].sum().backward()
     assert colors[drawn].isfinite().all()
-    assert all(value.grad is not None and value.grad[1:].eq(0).all() for value in fast)
-    assert all(value.grad is not None and value.grad.isfinite().all() for value in fast[1:])
+    for value in fast:
+        assert value.grad is not None
+        assert value.grad[1:].eq(0).all()
+    for value in fast[1:]:
+        assert value.grad is not None
+        assert value.grad.isfinite().all()
 
 
 # --- determinism ---
@@ -348,7 +365,8 @@ ITERATIONS = 16
 
 def run(folder: Path, parser: ColmapDataParserConfig, seed: int) -> dict[str, Any]:
     config = configure(folder, parser, iterations=ITERATIONS)
-    config.machine.seed, config.pipeline.views_per_iteration = seed, 2
+    config.machine.seed = seed
+    config.pipeline.views_per_iteration = 2
     return checkpoint(train(config), ITERATIONS - 1)
 
 
@@ -358,7 +376,8 @@ def run(folder: Path, parser: ColmapDataParserConfig, seed: int) -> dict[str, An
 )
 @pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU adds up gradients in no fixed order")
 def test_two_cpu_runs_with_one_seed_are_bitwise_equal(colmap: ColmapDataParserConfig, tmp_path: Path):
-    first, second = (run(tmp_path / name, colmap, seed=42) for name in ("first", "second"))
+    first = run(tmp_path / "first", colmap, seed=42)
+    second = run(tmp_path / "second", colmap, seed=42)
     assert len(first["pipeline"]["_model.gauss_params.means"]) > 300
     assert differences(first, second) == []
     assert differences(first, run(tmp_path / "other", colmap, seed=43)) != []

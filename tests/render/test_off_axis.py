@@ -13,7 +13,8 @@ from helpers.rendered_scene import random_scene
 from sadgs_ns.render.off_axis import cull_off_axis
 from sadgs_ns.render.rasterization import visible
 
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 
 
 def test_the_distance_counts_in_half_images_along_each_axis():
@@ -23,7 +24,8 @@ def test_the_distance_counts_in_half_images_along_each_axis():
     expected = [True, True, False, True, True, False, False, False]
     for radii in (torch.full((1, 8), 3, dtype=torch.int32), torch.full((1, 8, 2), 3, dtype=torch.int32)):
         culled = cull_off_axis(radii, means2d, WIDTH, HEIGHT, 2.0)
-        assert culled.dtype == torch.int32 and culled.shape == radii.shape
+        assert culled.dtype == torch.int32
+        assert culled.shape == radii.shape
         assert visible({"radii": culled, "means2d": means2d})[0].tolist() == expected
 
 
@@ -60,7 +62,9 @@ def test_what_is_not_drawn_has_no_gradient():
     colors, _, info = rasterization(**arguments, width=40, height=40, sh_degree=3, max_off_axis=2.0)
     colors.sum().backward()
     nowhere = ~visible(info).any(dim=0)
-    assert means.grad is not None and (means.grad[nowhere] == 0).all() and (means.grad[~nowhere] != 0).any()
+    assert means.grad is not None
+    assert (means.grad[nowhere] == 0).all()
+    assert (means.grad[~nowhere] != 0).any()
 
 
 @pytest.mark.hard_case(
@@ -75,4 +79,5 @@ def test_a_giant_beside_the_view_covers_none_of_it():
             torch.tensor([[30.0, 0.0, 0.85]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([[324.0, 26.0, 1.6]]),
             torch.tensor([0.97]), torch.ones((1, 3)), torch.eye(4)[None], K, WIDTH, HEIGHT, max_off_axis=max_off_axis,
         )  # fmt: skip
-        assert bool((alphas > 0.5).all()) is covered and bool((alphas == 0).all()) is not covered
+        assert bool((alphas > 0.5).all()) is covered
+        assert bool((alphas == 0).all()) is not covered

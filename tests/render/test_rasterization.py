@@ -100,7 +100,8 @@ def test_viewmats_project_nerfstudios_rays_to_their_pixels(dtype: torch.dtype) -
         assert (seen[:, 2] > 0).all()
         pixels = seen @ camera[index].get_intrinsics_matrices().to(dtype).T
         expected = camera.get_image_coords().flip(-1).reshape(-1, 2).to(dtype)  # pixel centres as (x, y)
-        torch.testing.assert_close(pixels[:, :2] / pixels[:, 2:], expected, rtol=0, atol=1e-3)
+        actual = pixels[:, :2] / pixels[:, 2:]
+        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-3)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")

@@ -46,7 +46,8 @@ def test_a_hard_case_without_both_texts_is_refused(arguments: str, tmp_path: Pat
 
 
 def test_tables_are_what_their_rows_give(capsys: pytest.CaptureFixture[str]):
-    assert benchmarks.main(["documents", str(CHECKOUT), "--check"]) == 0, "".join(capsys.readouterr())
+    status = benchmarks.main(["documents", str(CHECKOUT), "--check"])
+    assert status == 0, "".join(capsys.readouterr())
 
 
 DOCUMENTS = [CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
@@ -60,7 +61,8 @@ def without_code(text: str) -> str:
 
 def anchors(path: Path) -> set[str]:
     """What a document's headings are called in links, as GitHub does."""
-    found, names = set[str](), Counter[str]()
+    found = set[str]()
+    names = Counter[str]()
     for heading in re.findall(r"^#+ +(.+)$", without_code(path.read_text("utf8")), re.MULTILINE):
         text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).strip().lower()
         kept = "".join(c for c in text if c in "-_ " or unicodedata.category(c)[0] in "LMN")
@@ -112,7 +114,8 @@ def test_every_test_that_a_document_names_is_there():
     files = [str(path.relative_to(CHECKOUT)) for path in CHECKOUT.glob("tests/**/test_*.py")]
     known = {name for file in files for name in names_in(file)[0]} | {Path(file).stem for file in files}
     named = {name for path in DOCUMENTS for name in re.findall(r"\btest_[a-z\d]+_[a-z\d]+_\w+", path.read_text("utf8"))}
-    assert len(named) > 20 and named <= known, named - known
+    assert len(named) > 20, named - known
+    assert named <= known, named - known
 
 
 def test_the_version_and_its_date_are_the_same_wherever_they_stand():

@@ -38,10 +38,12 @@ FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-inst
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""
 RUN_BY = {
     "make test": ".ci/run",
+    "make test-slow": ".ci/run",
     "make test-portable": ".ci/run",
     "make lint": ".ci/run",
     "make gate": ".ci/run",
     "make docs": ".ci/run",
+    "make turn": "tests/drawn_scene/test_turn.py::test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians",
     ".ci/run": ".github/workflows/tests.yml",
     "sadgs": "tests/cli/test_sadgs.py::test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing",
     "sadgs photos": "tests/cli/test_sadgs.py::"
@@ -55,6 +57,7 @@ RUN_BY = {
     "test_what_is_taken_away_is_told_and_not_in_the_file",
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
+    "python -m benchmarks captures": "tests/benchmarks/test_captures.py::test_what_matches_is_told_to_match",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
     "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",
@@ -155,7 +158,8 @@ def understood(words: Sequence[str], lenient: bool = False) -> Any:
     Raises:
         SystemExit: If it is not understood; what is wrong has been printed.
     """
-    parse_args, cli = ArgumentParser.parse_args, tyro.cli
+    parse_args = ArgumentParser.parse_args
+    cli = tyro.cli
 
     def parse(parser: ArgumentParser, *arguments: Any) -> None:
         for action in parser._actions:
@@ -178,11 +182,13 @@ def understood(words: Sequence[str], lenient: bool = False) -> Any:
 
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
 def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(command: Command):
-    first, words = command.words[0], list(command.words)
+    first = command.words[0]
+    words = list(command.words)
     if first == "make":
         assert re.search(rf"^{words[1]}:", (CHECKOUT / "Makefile").read_text("utf8"), re.MULTILINE)
     elif first == "pip":
-        files, known = [word for word in words[2:] if re.fullmatch(r"\.|.*\.txt", word)], PYPROJECT.read_text("utf8")
+        files = [word for word in words[2:] if re.fullmatch(r"\.|.*\.txt", word)]
+        known = PYPROJECT.read_text("utf8")
         assert all((CHECKOUT / file).exists() for file in files)
         assert all(word in known for word in words[2:] if word not in files and not word.startswith("-"))
     elif not command.is_foreign and first != ".ci/run":
@@ -194,7 +200,8 @@ def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(c
             labels = [
                 job.row.label for job in jobs if re.search(given.only, f"{job.scene.name}/{job.row.label}/{job.seed}")
             ]
-            assert labels and given.reference in (None, *labels)
+            assert labels
+            assert given.reference in (None, *labels)
 
     file, _, name = (command.run_by or "").partition("::")
     if name:
@@ -246,6 +253,7 @@ def shortened(command: Command) -> str:
     return f"{line} {SHORTER.get(start, '')}".strip()
 
 
+@pytest.mark.slow
 def test_commands_that_no_other_test_runs_work_in_the_order_of_the_documents(tmp_path: Path):
     """They find `scene` and what those before them made."""
     write_scene(tmp_path / "scene", WIDTH, HEIGHT, 16, POINTS)
@@ -260,7 +268,8 @@ def test_commands_that_no_other_test_runs_work_in_the_order_of_the_documents(tmp
     environment = {**os.environ, **nowhere, "TORCH_HOME": str(tmp_path)}
     run = forked_python.python(RUN_ALL.format(str(tmp_path), commands), environment)
     assert run.returncode == 0, run.stdout + run.stderr
-    assert (tmp_path / "outputs/scene/sadgs/run/inspect").is_dir() and (tmp_path / "splat.ply").is_file()
+    assert (tmp_path / "outputs/scene/sadgs/run/inspect").is_dir()
+    assert (tmp_path / "splat.ply").is_file()
 
 
 def with_options() -> list[str]:

@@ -72,7 +72,8 @@ def test_the_folders_depend_on_each_other_in_one_way():
 
 
 def test_no_module_imports_itself_through_others():
-    list(graphlib.TopologicalSorter(GRAPH).static_order())  # raises CycleError, which names the circle
+    order = list(graphlib.TopologicalSorter(GRAPH).static_order())  # CycleError names a circle.
+    assert set(order) >= GRAPH.keys()
 
 
 def test_the_method_knows_nothing_of_nerfstudio():
@@ -100,7 +101,8 @@ def test_no_file_is_too_long():
 
 def names_of_gsplat(path: Path) -> set[str]:
     """Dotted names in gsplat that a file imports (for type checkers, too), reads from what it imports, or quotes."""
-    names, bound = set(), {}
+    names = set()
+    bound = {}
     nodes = list(ast.walk(ast.parse(path.read_text("utf8"))))
     for node in nodes:
         if isinstance(node, ast.Import):

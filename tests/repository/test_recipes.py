@@ -23,7 +23,8 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 
 CHECKOUT = Path(__file__).parents[2]
-WIDTH, HEIGHT = 64, 48
+WIDTH = 64
+HEIGHT = 48
 
 
 def blocks(heading: str, language: str = "python") -> list[str]:
@@ -46,9 +47,12 @@ def train(strategy: StructureAwareStrategy, steps: int) -> tuple[dict[str, Any],
     """The strategy's state after some steps on noise, and the number of Gaussians after each."""
     params = random_params(60)
     params["scales"].data += 1.0  # up to 10 px
-    optimizers, state, (viewmats, Ks) = adam(params), strategy.initialize_state(1.0), camera(WIDTH, HEIGHT)
+    optimizers = adam(params)
+    state = strategy.initialize_state(1.0)
+    viewmats, Ks = camera(WIDTH, HEIGHT)
     images = torch.rand((1, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(0))
-    tensors, counts = multiscale_structure_tensor(images), []
+    tensors = multiscale_structure_tensor(images)
+    counts = []
     for step in range(steps):
         training_step(strategy, params, optimizers, state, step, images, tensors, viewmats, Ks)
         counts.append(len(params["means"]))
@@ -64,8 +68,11 @@ def test_a_statistic(monkeypatch: pytest.MonkeyPatch):
     )  # fmt: skip
     state, counts = train(strategy, 12)
     assert counts[8] > counts[7] == 60
-    eta_sum, bound = state["eta_sum"], state["eta_max"] * state["n_total"][:, None]
-    assert eta_sum.shape == (counts[-1], 3) and eta_sum.any() and (eta_sum <= bound * (1 + 1e-5)).all()
+    eta_sum = state["eta_sum"]
+    bound = state["eta_max"] * state["n_total"][:, None]
+    assert eta_sum.shape == (counts[-1], 3)
+    assert eta_sum.any()
+    assert (eta_sum <= bound * (1 + 1e-5)).all()
 
 
 def test_a_rule_of_growth(monkeypatch: pytest.MonkeyPatch):
@@ -98,7 +105,8 @@ export.main(["--help"])
 """)
     assert run.returncode == 0, run.stderr
     assert (tmp_path / "splat.xyz").read_text() == "1 1 1\n" * 5
-    assert "glb, html, xyz, mesh.ply, and not 'no-such'" in run.stderr and ".html, .xyz, or .mesh.ply" in run.stdout
+    assert "glb, html, xyz, mesh.ply, and not 'no-such'" in run.stderr
+    assert ".html, .xyz, or .mesh.ply" in run.stdout
 
 
 def test_a_stage(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
@@ -109,14 +117,17 @@ def test_a_stage(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     added = entry("A stage between photos and a splat", sadgs)
     monkeypatch.setattr(sadgs, "STAGES", dict.fromkeys(sadgs.STAGES, stub) | added)
     monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
-    command, archive = [str(scene), "--output", str(tmp_path / "out"), "--formats", "ply"], tmp_path / "out" / "log.zip"
+    command = [str(scene), "--output", str(tmp_path / "out"), "--formats", "ply"]
+    archive = tmp_path / "out" / "log.zip"
     for status in (f"{archive}", f"{archive}; done before"):
         assert sadgs.main(command) == 0
         lines = re.findall(r"^(\S+) +\d:\d\d  (.*)$", capsys.readouterr().out, re.MULTILINE)
-        assert lines[:4] == [*((name, "done before") for name in ("cameras", "training", "export")), ("logs", status)]
+        expected = [*((name, "done before") for name in ("cameras", "training", "export")), ("logs", status)]
+        assert lines[:4] == expected
     assert archive.is_file()
 
 
+@pytest.mark.slow
 def test_a_protocol(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Its row of half the effort, two iterations long, on a drawn scene, and the table of a document."""
     (shown,) = map(yaml.safe_load, blocks("A protocol to measure", "yaml"))
@@ -131,9 +142,12 @@ def test_a_protocol(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("TORCH_HOME", "/dev/null")  # LPIPS is left out.
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
     rows = results / "rows.jsonl"
-    assert bench.main([str(tmp_path / "mine.yaml"), "--scenes", str(tmp_path), "--output", str(rows)]) == 0
+    status = bench.main([str(tmp_path / "mine.yaml"), "--scenes", str(tmp_path), "--output", str(rows)])
+    assert status == 0
     (found,) = map(json.loads, rows.read_text().splitlines())
-    assert (found["label"], found["status"], found["iterations"]) == ("draft", "ok", 2)
+    assert found["label"] == "draft"
+    assert found["status"] == "ok"
+    assert found["iterations"] == 2
     line = {"rows": "rows.jsonl", "scenes": ["garden"], "labels": {"draft": "half the effort"}}
     table = {"kind": "runs", "columns": ["scene", "method", "psnr"], "lines": [line]}
     (results / "tables.yaml").write_text(yaml.dump({"megapixels": {}, "tables": {"mine": table}}))
@@ -150,4 +164,5 @@ def test_a_step_is_profiled(scene: Path, tmp_path: Path):
     words += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
     run = forked_python.python(f"import sys\nsys.argv[:] = {words}\n{program}")
     assert run.returncode == 0, run.stderr
-    assert run.stdout.count("Self CPU time total") == 1 and re.search(r"aten::mul +.* \d+ *$", run.stdout, re.MULTILINE)
+    assert run.stdout.count("Self CPU time total") == 1
+    assert re.search(r"aten::mul +.* \d+ *$", run.stdout, re.MULTILINE)

@@ -92,7 +92,8 @@ def test_the_wheel_holds_all_files_of_the_package_and_no_others(wheel: Wheel):
         names = set(archive.namelist())
     described = {name for name in names if name.partition("/")[0].endswith(".dist-info")}
     files = files_of_the_package()
-    assert "sadgs_ns/py.typed" in files and "sadgs_ns/__init__.py" in files
+    assert "sadgs_ns/py.typed" in files
+    assert "sadgs_ns/__init__.py" in files
     assert names - described == files
     assert os.access(wheel.installed / "sadgs_ns" / "launchers" / "ffmpeg", os.X_OK)
 

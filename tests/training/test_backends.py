@@ -33,7 +33,8 @@ ON_GPU = torch.cuda.is_available()
 def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> SadgsTrainerConfig:
     """A run with AbsGS and structure steps, and with matrices of colours."""
     config = configure(tmp_path, colmap, ITERATIONS)
-    config.pipeline.model.backend, config.pipeline.model.color_model = "gsplat", "affine"
+    config.pipeline.model.backend = "gsplat"
+    config.pipeline.model.color_model = "affine"
     config.pipeline.views_per_iteration = 2
     return config
 
@@ -45,7 +46,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         stub_gsplat(monkeypatch, RADII_PER_AXIS)
         for module in (rasterization, model_module, config_module):
             monkeypatch.setattr(module, "choose_backend", lambda wanted, *place: wanted)
-    composite, numbers = gsplat.rasterize_to_pixels, []
+    composite = gsplat.rasterize_to_pixels
+    numbers = []
 
     def counted(means2d: torch.Tensor, *args: Any, **options: Any) -> Any:
         numbers.append(means2d.shape[1])
@@ -56,24 +58,31 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def resumed(config: SadgsTrainerConfig, whole: SadgsTrainer, folder: Path) -> SadgsTrainer:
-    config.output_dir, config.load_dir, config.load_step = folder, whole.checkpoint_dir, ITERATIONS // 2
+    config.output_dir = folder
+    config.load_dir = whole.checkpoint_dir
+    config.load_step = ITERATIONS // 2
     return train(config)
 
 
 def test_it_trains_resumes_and_exports(
     config: SadgsTrainerConfig, drawn: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    config.steps_per_save, config.save_only_latest_checkpoint = ITERATIONS // 2, False
+    config.steps_per_save = ITERATIONS // 2
+    config.save_only_latest_checkpoint = False
     config.max_num_iterations = ITERATIONS
     whole = train(config)
     model = whole.pipeline.model
-    assert model.backend == "gsplat" and len(drawn) >= ITERATIONS
+    assert model.backend == "gsplat"
+    assert len(drawn) >= ITERATIONS
     assert is_finite(model)
     steps: Any = model.strategy_state["structure_steps"]
-    assert sum(step["split"] for step in steps) > 0 and model.num_points > steps[0]["before"]
-    assert model.color_matrices is not None and model.color_matrices.detach().abs().sum() > 0
+    assert sum(step["split"] for step in steps) > 0
+    assert model.num_points > steps[0]["before"]
+    assert model.color_matrices is not None
+    assert model.color_matrices.detach().abs().sum() > 0
     again = resumed(config, whole, tmp_path / "again")
-    assert is_finite(again.pipeline.model) and again.pipeline.model.step == ITERATIONS - 1
+    assert is_finite(again.pipeline.model)
+    assert again.pipeline.model.step == ITERATIONS - 1
     if not ON_GPU:  # There, atomic additions round in any order.
         for name, value in model.gauss_params.items():
             assert torch.equal(again.pipeline.model.gauss_params[name], value), name
@@ -86,8 +95,10 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
     losses: list[list[float]] = []
     config.max_num_iterations = 3
     for backend in ("gsplat", "torch"):
-        config.pipeline.model.backend, config.output_dir = backend, tmp_path / backend
-        trainer, of_run = set_up(config), []
+        config.pipeline.model.backend = backend
+        config.output_dir = tmp_path / backend
+        trainer = set_up(config)
+        of_run = []
         iterate = trainer.train_iteration
 
         def noted(step: int, iterate: Any = iterate, of_run: list[float] = of_run) -> Any:
@@ -98,8 +109,10 @@ def test_it_begins_as_a_run_of_another_backend_does(config: SadgsTrainerConfig, 
         trainer.train_iteration = noted  # type: ignore[method-assign]
         trainer.train()
         losses.append(of_run)
-    assert drawn and len(losses[0]) == 3
-    assert losses[0][0] == pytest.approx(losses[1][0], rel=1e-4)
+    assert drawn
+    assert len(losses[0]) == 3
+    expected = pytest.approx(losses[1][0], rel=1e-4)
+    assert losses[0][0] == expected
     assert losses[0] == pytest.approx(losses[1], rel=1e-2)  # Adam steps as far where rounding decides a sign.
 
 
@@ -122,7 +135,8 @@ def test_where_it_cannot_draw_it_is_refused(config: SadgsTrainerConfig, monkeypa
     with pytest.raises(InputError, match=r"^The backend gsplat works on one device only, and this run takes several: "):
         rasterization.choose_backend("gsplat", torch.device("cuda"), single_process=False)
     config.pipeline.model.backend = "auto"
-    model, world = set_up(config).pipeline.model, World()
+    model = set_up(config).pipeline.model
+    world = World()
     asked: list[Any] = []
     monkeypatch.setattr(model_module, "choose_backend", lambda *args: asked.append(args))
     model.shard(world)
@@ -142,14 +156,17 @@ def test_with_triton_nothing_calls_gsplats_cuda_code(
     config = configure(tmp_path, colmap, ITERATIONS)
     trainer = train(config)
     model = trainer.pipeline.model
-    assert model.backend == "triton" and is_finite(model)
+    assert model.backend == "triton"
+    assert is_finite(model)
     steps: Any = model.strategy_state["structure_steps"]
     assert sum(step["split"] for step in steps) > 0
     cameras = trainer.pipeline.datamanager.eval_dataset.cameras
     with torch.no_grad():
         outputs = model.get_outputs(cameras[0:1].to(model.device))
         normals = model.get_normals(cameras[0:1].to(model.device))
-    assert outputs["rgb"].isfinite().all() and (outputs["depth"] > 0).any()
+    assert outputs["rgb"].isfinite().all()
+    assert (outputs["depth"] > 0).any()
     assert normals.shape == outputs["rgb"].shape
     run = [str(trainer.base_dir), "--data", str(scene)]
-    assert export.main([*run, "--output", str(tmp_path / "splat.ply"), "--min-views", "1"]) == 0
+    status = export.main([*run, "--output", str(tmp_path / "splat.ply"), "--min-views", "1"])
+    assert status == 0

@@ -127,14 +127,15 @@ def model(config: SadgsModelConfig) -> SadgsModel:
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
 def test_every_public_field_is_followed_by_a_docstring(cls: type):
     body = body_of(cls)
-    undocumented = [
-        ast.unparse(statement.target)
-        for statement, following in zip(body, [*body[1:], ast.Pass()], strict=True)
-        if isinstance(statement, ast.AnnAssign)
-        and not ast.unparse(statement.target).startswith("_")
-        and not is_string(following)
-    ]
-    assert is_string(body[0]) and undocumented == []
+    undocumented = []
+    for statement, following in zip(body, [*body[1:], ast.Pass()], strict=True):
+        if not isinstance(statement, ast.AnnAssign):
+            continue
+        name = ast.unparse(statement.target)
+        if not name.startswith("_") and not is_string(following):
+            undocumented.append(name)
+    assert is_string(body[0])
+    assert undocumented == []
 
 
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
@@ -143,7 +144,8 @@ def test_every_class_attribute_is_a_dataclass_field(cls: type):
     assigned = {ast.unparse(target) for each in body if isinstance(each, ast.Assign) for target in each.targets}
     assert assigned <= NO_OPTIONS
     annotated = {ast.unparse(statement.target) for statement in body if isinstance(statement, ast.AnnAssign)}
-    assert annotated and annotated <= {field.name for field in dataclasses.fields(cls)}
+    assert annotated
+    assert annotated <= {field.name for field in dataclasses.fields(cls)}
 
 
 def test_nerfstudio_finds_the_methods_through_their_entry_points():
@@ -204,7 +206,8 @@ def test_the_help_shows_at_most_75_options_each_with_a_sentence(method: str, hel
     assert "Hard cap on the number of Gaussians" in options["--pipeline.model.strategy.max-gaussians"]
     assert "Training views rendered for one optimizer step" in options["--pipeline.views-per-iteration"]
     texts = {name: text.partition("(default:")[0].strip() for name, text in options.items() if name != "-h,"}
-    assert {name: text for name, text in texts.items() if not re.search(r"\w+ \w+.*\.$", text)} == {}
+    actual = {name: text for name, text in texts.items() if not re.search(r"\w+ \w+.*\.$", text)}
+    assert actual == {}
 
 
 def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only_the_rates(helps: dict[str, str]):
@@ -236,12 +239,18 @@ def test_options_that_the_help_hides_are_accepted():
     """nerfstudio's users have them in their commands."""
     config: Any = tyro.cli(AnnotatedBaseConfigUnion, args=["sadgs", *HIDDEN_OPTIONS.split()])
     config.check()
-    assert (config.project_name, config.load_scheduler, config.steps_per_eval_batch) == ("mine", False, 7)
-    assert (config.logging.steps_per_log, config.logging.local_writer.max_log_size) == (50, 0)
-    assert config.viewer.make_share_url and config.viewer.camera_frustum_scale == 0.2
-    assert config.pipeline.datamanager.max_thread_workers == 2 and config.pipeline.model.color_corrected_metrics
+    assert config.project_name == "mine"
+    assert config.load_scheduler is False
+    assert config.steps_per_eval_batch == 7
+    assert config.logging.steps_per_log == 50
+    assert config.logging.local_writer.max_log_size == 0
+    assert config.viewer.make_share_url
+    assert config.viewer.camera_frustum_scale == 0.2
+    assert config.pipeline.datamanager.max_thread_workers == 2
+    assert config.pipeline.model.color_corrected_metrics
     means = config.optimizers["means"]
-    assert means["optimizer"].eps == 1e-8 and means["scheduler"].max_steps == 500
+    assert means["optimizer"].eps == 1e-8
+    assert means["scheduler"].max_steps == 500
 
 
 @pytest.mark.hard_case("nerfstudio's options that cannot work here, such as `mixed-precision`", "refused, with why")
@@ -269,7 +278,10 @@ def test_options_that_the_help_hides_and_that_cannot_work_say_why(words: str, se
 @pytest.mark.parametrize("cls", CONFIG_CLASSES)
 def test_help_texts_break_their_lines_between_sentences_as_tyro_does_not_join_them(cls: type):
     texts = [s.value.value for s in body_of(cls)[1:] if is_string(s)]  # type: ignore[attr-defined]
-    assert texts and not [text for text in texts if not all(line.endswith(".") for line in text.strip().splitlines())]
+    assert texts
+    for text in texts:
+        for line in text.strip().splitlines():
+            assert line.endswith("."), text
 
 
 def test_small_images_bound_the_number_of_starting_points(capsys: pytest.CaptureFixture[str]):
@@ -342,7 +354,8 @@ def test_options_of_the_pipeline_that_are_out_of_range_are_refused(option: str, 
 
 def test_gaussians_are_neither_added_nor_removed_where_densification_ends_at_0():
     strategy = StructureAwareStrategy(refine_stop_iter=0).for_run(3000)
-    assert not any(strategy.observes(step) or strategy.needs_absgrad(step) for step in range(3000))
+    for step in range(3000):
+        assert not (strategy.observes(step) or strategy.needs_absgrad(step))
 
 
 def test_the_device_is_the_cpu_where_there_is_no_cuda(monkeypatch: pytest.MonkeyPatch):
@@ -370,7 +383,8 @@ def test_what_is_decided_in_a_run_is_no_option():
 
 
 def test_an_installation_holds_every_module_and_nothing_that_measures(tmp_path: Path):
-    source, installed = tmp_path / "source", tmp_path / "installed"
+    source = tmp_path / "source"
+    installed = tmp_path / "installed"
     source.mkdir()
     for name in ("sadgs_ns", "benchmarks", "examples", "configs", "README.md", "LICENSE"):
         (source / name).symlink_to(CHECKOUT / name)
@@ -430,22 +444,37 @@ def test_pre_commit_checks_what_make_lint_does():
 
 
 def test_the_papers_presets_are_sadgs_without_what_we_added():
-    config, paper, indoor = preset("sadgs"), preset("sadgs-paper"), preset("sadgs-paper-indoor")
+    config = preset("sadgs")
+    paper = preset("sadgs-paper")
+    indoor = preset("sadgs-paper-indoor")
     model = config.pipeline.model
-    assert model.ssim_lambda > 0.2 and model.opacity_reg > 0 and model.strategy.child_scale > 1
-    model.ssim_lambda, model.opacity_reg, model.strategy.child_scale = 0.2, 0.0, 1.0
+    assert model.ssim_lambda > 0.2
+    assert model.opacity_reg > 0
+    assert model.strategy.child_scale > 1
+    model.ssim_lambda = 0.2
+    model.opacity_reg = 0.0
+    model.strategy.child_scale = 1.0
     model.averaged_share = model.max_angular_scale = 0.0
     model.near_plane = "scene"
-    model.stereo_points, model.starts_per_pixel, model.clear_paths = 0, 0.0, False
+    model.stereo_points = 0
+    model.starts_per_pixel = 0.0
+    model.clear_paths = False
     model.dropout = 0.0
-    model.strategy.clone_grad2d, model.strategy.split_absgrad2d = 2e-4, 4e-4
-    model.strategy.structure_every, model.strategy.absgs_every, model.strategy.reset_every = 500, 100, 1200
-    model.strategy.min_opacity, model.strategy.refine_start_iter, model.strategy.refine_stop_iter = 0.005, 100, 1900
+    model.strategy.clone_grad2d = 2e-4
+    model.strategy.split_absgrad2d = 4e-4
+    model.strategy.structure_every = 500
+    model.strategy.absgs_every = 100
+    model.strategy.reset_every = 1200
+    model.strategy.min_opacity = 0.005
+    model.strategy.refine_start_iter = 100
+    model.strategy.refine_stop_iter = 1900
     model.strategy.absgs_long_axis = False
     model.strategy.eta_every = model.strategy.min_observations = 1
     model.strategy.split_min_opacity = config.pipeline.energy_blur = 0.0
     config.pipeline.epsilon = 1e-6
-    config.max_num_iterations, config.pipeline.views_per_iteration, config.rates_follow_views = 3000, 1, False
+    config.max_num_iterations = 3000
+    config.pipeline.views_per_iteration = 1
+    config.rates_follow_views = False
     config.optimizers["scales"]["optimizer"].lr = 0.01
     for group in ("features_dc", "features_rest", "opacities"):
         del config.optimizers[group]["scheduler"]

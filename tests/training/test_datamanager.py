@@ -78,12 +78,14 @@ def test_colmap_s_points_are_nerfstudio_s_to_the_bit(
     assert reads == []
     for metadata in (datamanager.train_dataparser_outputs.metadata, datamanager.train_dataset.metadata):
         for name in READ:
-            assert metadata[name].dtype == expected[name].dtype and torch.equal(metadata[name], expected[name])
+            assert metadata[name].dtype == expected[name].dtype
+            assert torch.equal(metadata[name], expected[name])
 
 
 def test_matches_of_points_are_left_to_nerfstudio(colmap: ColmapDataParserConfig, reads: list[Path]):
     datamanager = load(dataclasses.replace(colmap, max_2D_matches_per_3D_point=-1))
-    assert len(reads) == 1 and "points3D_points2D_xy" in datamanager.train_dataset.metadata
+    assert len(reads) == 1
+    assert "points3D_points2D_xy" in datamanager.train_dataset.metadata
 
 
 MARK = b"\xef\xbb\xbf"
@@ -126,9 +128,11 @@ def test_a_byte_order_mark_is_refused_by_the_file_s_name(kind: str, colmap: Colm
         parser: DataParserConfig = text_model(colmap, tmp_path / "scene")
         file = parser.data / SPARSE_FOLDER / kind
     elif kind == "blender":
-        parser, file = blender_data(tmp_path, "white"), tmp_path / "transforms_train.json"
+        parser = blender_data(tmp_path, "white")
+        file = tmp_path / "transforms_train.json"
     else:
-        parser, file = nerfstudio_data(tmp_path), tmp_path / kind
+        parser = nerfstudio_data(tmp_path)
+        file = tmp_path / kind
     file.write_bytes(MARK + file.read_bytes())
     with pytest.raises(InputError) as refused:
         check_capture(SadgsDatamanagerConfig(dataparser=parser))
@@ -161,7 +165,8 @@ def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
     metadata = load(parser).train_dataset.metadata  # a question would raise: pytest gives it no terminal
     of_file = load(dataclasses.replace(parser, data=path)).train_dataset.metadata
     assert torch.equal(of_file["points3D_xyz"], metadata["points3D_xyz"])
-    assert json.loads(path.read_text()) == before and reads == []
+    assert json.loads(path.read_text()) == before
+    assert reads == []
     applied = torch.tensor(transform or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=torch.float32)
     create_ply_from_colmap("p.ply", tmp_path / "colmap/sparse/0", tmp_path, applied)  # what it would do after a yes
     path.write_text(json.dumps({**before, "applied_transform": applied.tolist(), "ply_file_path": "p.ply"}))
@@ -193,10 +198,14 @@ def test_views_that_are_added_move_nothing_in_a_frame_that_the_data_fix(colmap: 
     frame = {"dataparser_transform": first.dataparser_transform.tolist(), "dataparser_scale": first.dataparser_scale}
     fixed = parsed(**frame)
     assert torch.equal(fixed.dataparser_transform, first.dataparser_transform)
-    assert fixed.dataparser_scale == first.dataparser_scale and len(fixed.cameras) == len(frames)
+    assert fixed.dataparser_scale == first.dataparser_scale
+    assert len(fixed.cameras) == len(frames)
     same = [fixed.image_filenames.index(path) for path in first.image_filenames]
-    torch.testing.assert_close(fixed.cameras.camera_to_worlds[same], first.cameras.camera_to_worlds, atol=1e-6, rtol=0)
-    torch.testing.assert_close(fixed.metadata["points3D_xyz"], first.metadata["points3D_xyz"], atol=1e-6, rtol=0)
+    actual = fixed.cameras.camera_to_worlds[same]
+    torch.testing.assert_close(actual, first.cameras.camera_to_worlds, atol=1e-6, rtol=0)
+    actual = fixed.metadata["points3D_xyz"]
+    expected = first.metadata["points3D_xyz"]
+    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
 
 
 @pytest.mark.hard_case(
@@ -260,7 +269,8 @@ def move_model(folder: Path, by: np.ndarray, suffix: str = ".bin") -> None:
 )
 @pytest.mark.parametrize("kind", ["a COLMAP model", "a PLY", "an old ns-process-data"])
 def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDataParserConfig, tmp_path: Path):
-    by, applied = np.array([5e5, 5.4e6, 200.0]), np.array([[0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 5.0]])
+    by = np.array([5e5, 5.4e6, 200.0])
+    applied = np.array([[0, 1, 0, 3], [1, 0, 0, 0], [0, 0, -1, 5.0]])
     outputs = []
     for folder, offset in ((tmp_path / "near", 0 * by), (tmp_path / "far", by)):
         if kind == "a COLMAP model":
@@ -285,9 +295,8 @@ def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDat
     points = [each.metadata["points3D_xyz"] for each in outputs]
     torch.testing.assert_close(points[1], points[0], atol=1e-5, rtol=0)
     maps = [Similarity.of(each.dataparser_scale * each.dataparser_transform.double().numpy()) for each in outputs]
-    there, here = (
-        similarity.inverse().positions(found.double().numpy()) for similarity, found in zip(maps, points, strict=True)
-    )
+    there = maps[0].inverse().positions(points[0].double().numpy())
+    here = maps[1].inverse().positions(points[1].double().numpy())
     np.testing.assert_allclose(here - by, there, atol=1e-4)
 
 
@@ -326,7 +335,8 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     monkeypatch.setattr(ply, "read_points", lambda path: mine.append(path) or read(path))
     parser = ply_scene(tmp_path, text, COLORS.astype(np.uint8))
     datamanager = load(parser)
-    assert reads == [] and mine == [tmp_path / "points.ply"]
+    assert reads == []
+    assert mine == [tmp_path / "points.ply"]
     outputs = datamanager.train_dataparser_outputs
     homogeneous = torch.cat([torch.tensor(POSITIONS), torch.ones(3, 1)], dim=1)
     expected = (homogeneous @ outputs.dataparser_transform.T.double() * outputs.dataparser_scale).float()
@@ -341,7 +351,8 @@ def test_other_parsers_read_a_ply_without_open3d(tmp_path: Path, monkeypatch: py
     monkeypatch.setitem(sys.modules, "open3d", None)
     ply_scene(tmp_path / "ply", colors=COLORS.astype(np.uint8))
     parser = blender_data(tmp_path / "blender", "white")
-    parser.ply_path, parser.scale_factor = tmp_path / "ply/points.ply", 3.0
+    parser.ply_path = tmp_path / "ply/points.ply"
+    parser.scale_factor = 3.0
     metadata = load(parser).train_dataset.metadata
     np.testing.assert_allclose(metadata["points3D_xyz"], 3 * POSITIONS)
     assert metadata["points3D_rgb"].tolist() == COLORS.tolist()
@@ -385,7 +396,8 @@ def test_points_of_a_ply_file_are_nerfstudio_s(tmp_path: Path, open3d: None):
 )
 def test_colours_of_a_ply_file(colors: np.ndarray | None, expected: list, tmp_path: Path):
     metadata = load(ply_scene(tmp_path, colors=colors)).train_dataset.metadata
-    assert metadata["points3D_rgb"].dtype == torch.uint8 and metadata["points3D_rgb"].tolist() == expected
+    assert metadata["points3D_rgb"].dtype == torch.uint8
+    assert metadata["points3D_rgb"].tolist() == expected
 
 
 @pytest.mark.hard_case(
@@ -422,12 +434,14 @@ def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp
     rows = [(*place, *color, other(i)) for i, (place, color) in enumerate(zip(POSITIONS, COLORS, strict=True))]
     vertices = np.array(rows, fields)
     faces = np.array([([0, 1, 2],)], [("vertex_indices", "<i4", (3,))])
-    before, after = (PlyElement.describe(faces, name) for name in ("face", "edge"))
+    before = PlyElement.describe(faces, "face")
+    after = PlyElement.describe(faces, "edge")
     points = PlyElement.describe(vertices, "vertex", len_types={"track": "u1"}, val_types={"track": "i4"})
     whole = PlyData([before, points, after], text=order == "text", byte_order="<" if order == "text" else order)
     whole.write(str(tmp_path / "a.ply"))
     positions, colors = ply.read_points(tmp_path / "a.ply")
-    assert positions.tolist() == POSITIONS.tolist() and colors.tolist() == COLORS.tolist()
+    assert positions.tolist() == POSITIONS.tolist()
+    assert colors.tolist() == COLORS.tolist()
 
 
 @pytest.mark.hard_case("a PLY of points without colours", "trains from grey points; the check notes it")
@@ -444,7 +458,8 @@ def test_colours_of_a_splat_are_those_of_degree_0(tmp_path: Path):
     coefficients[0] = [9, -9, np.nan]
     ply_scene(tmp_path, colors=coefficients.astype(np.float32), names=[f"f_dc_{index}" for index in range(3)])
     _, colors = ply.read_points(tmp_path / "points.ply")
-    assert colors.tolist() == [[255, 0, 128], *COLORS[1:].tolist()]
+    expected = [[255, 0, 128], *COLORS[1:].tolist()]
+    assert colors.tolist() == expected
 
 
 def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):
@@ -456,4 +471,5 @@ def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):
 def test_points_that_are_not_asked_for_are_not_read(colmap: ColmapDataParserConfig, reads: list[Path]):
     parser = dataclasses.replace(colmap, load_3D_points=False)
     datamanager = load(parser)
-    assert reads == [] and not datamanager.train_dataset.metadata.keys() & set(READ)
+    assert reads == []
+    assert not datamanager.train_dataset.metadata.keys() & set(READ)

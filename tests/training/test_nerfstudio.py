@@ -87,7 +87,8 @@ def test_ns_train_leaves_one_checkpoint_of_the_last_iteration_that_loads_safely(
     state = torch.load(path, weights_only=True)
     assert state["step"] == ITERATIONS - 1
     means = state["pipeline"]["_model.gauss_params.means"]
-    assert len(means) > POINTS and means.isfinite().all()
+    assert len(means) > POINTS
+    assert means.isfinite().all()
 
 
 def test_making_lpips_draws_no_number_that_training_would(monkeypatch: pytest.MonkeyPatch):
@@ -109,7 +110,8 @@ def test_ns_eval_reports_psnr_and_ssim_and_says_once_why_lpips_is_missing(
         monkeypatch.setenv(name, "http://127.0.0.1:9")  # where nothing listens
     ComputePSNR(load_config=finished / "config.yml", output_path=tmp_path / "output.json").main()
     results = json.loads((tmp_path / "output.json").read_text())["results"]
-    assert 5 < results["psnr"] < 60 and 0 < results["ssim"] <= 1
+    assert 5 < results["psnr"] < 60
+    assert 0 < results["ssim"] <= 1
     assert not [name for name in results if "lpips" in name]
     printed = capsys.readouterr().out
     assert printed.count("LPIPS is not reported") == 1
@@ -140,7 +142,8 @@ def test_each_iteration_takes_its_number_of_views_in_nerfstudio_s_order(
     order = trainer.pipeline.datamanager.train_unseen_cameras  # of nerfstudio, which draws nothing from it
     assert len(order) == TRAIN_VIEWS
     trainer.train()
-    assert trainer.pipeline.views.sampler.draw(TRAIN_VIEWS - 3 * views) == order[3 * views :]
+    actual = trainer.pipeline.views.sampler.draw(TRAIN_VIEWS - 3 * views)
+    assert actual == order[3 * views :]
 
 
 def test_an_iteration_takes_no_more_views_than_there_are(
@@ -152,7 +155,9 @@ def test_an_iteration_takes_no_more_views_than_there_are(
     draw = ViewSampler.draw
     monkeypatch.setattr(ViewSampler, "draw", lambda *args: seen.append(draw(*args)) or seen[-1])
     assert train(config).pipeline.model.plan.views_per_iteration == TRAIN_VIEWS
-    assert len(seen) == 3 and all(sorted(drawn) == list(range(TRAIN_VIEWS)) for drawn in seen), "a round each"
+    assert len(seen) == 3, "a round each"
+    for drawn in seen:
+        assert sorted(drawn) == list(range(TRAIN_VIEWS)), "a round each"
 
 
 def test_no_view_at_all_per_iteration_is_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -171,10 +176,11 @@ def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserCo
         if trainer.step in (0, ITERATIONS - 1):
             with torch.no_grad():
                 trainer.pipeline.eval()
-                metrics = [
-                    trainer.pipeline.model.get_metrics_dict(trainer.pipeline.model.get_outputs(camera), batch)["psnr"]
-                    for camera, batch in (trainer.pipeline.datamanager.next_train(0) for _ in range(TRAIN_VIEWS))
-                ]
+                model = trainer.pipeline.model
+                metrics = []
+                for _ in range(TRAIN_VIEWS):
+                    camera, batch = trainer.pipeline.datamanager.next_train(0)
+                    metrics.append(model.get_metrics_dict(model.get_outputs(camera), batch)["psnr"])
             psnr.append(float(sum(metrics)) / TRAIN_VIEWS)
 
     train(config, measure)
@@ -182,20 +188,24 @@ def test_training_makes_the_training_views_more_alike(colmap: ColmapDataParserCo
 
 
 def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParserConfig, tmp_path: Path):
-    middle, last = 7, 15  # after the structure step of iteration 6, before AbsGS at 9, and beyond the last of them
+    middle = 7  # after the structure step of iteration 6, and before AbsGS at 9
+    last = 15  # beyond the last of them
     config = configure(tmp_path / "whole", colmap, iterations=last + 1)
     config.machine.device_type = "cpu"  # A GPU adds up gradients in no fixed order.
     config.pipeline.views_per_iteration = 2
-    config.steps_per_save, config.save_only_latest_checkpoint = middle, False
+    config.steps_per_save = middle
+    config.save_only_latest_checkpoint = False
     whole = train(config)
-    stopped, expected = checkpoint(whole, middle), checkpoint(whole, last)
+    stopped = checkpoint(whole, middle)
+    expected = checkpoint(whole, last)
     numbers = [len(state["pipeline"]["_model.gauss_params.means"]) for state in (stopped, expected)]
     assert POINTS < numbers[0] != numbers[1]
 
     resumed_config = configure(tmp_path / "resumed", copy.deepcopy(colmap), iterations=last + 1)
     resumed_config.machine.device_type = "cpu"
     resumed_config.pipeline.views_per_iteration = 2
-    resumed_config.load_dir, resumed_config.load_step = whole.checkpoint_dir, middle
+    resumed_config.load_dir = whole.checkpoint_dir
+    resumed_config.load_step = middle
     steps: list[int] = []
     resumed = train(resumed_config, lambda trainer: steps.append(trainer.step))
 
@@ -207,7 +217,9 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParse
 def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stopped_among_them(
     colmap: ColmapDataParserConfig, tmp_path: Path
 ):
-    iterations, averaged, stop = 20, 6, 16  # The mean is of the iterations 15 to 20.
+    iterations = 20
+    averaged = 6  # The mean is of the iterations 15 to 20.
+    stop = 16
 
     def configured(folder: str, share: float) -> SadgsTrainerConfig:
         config = configure(tmp_path / folder, copy.deepcopy(colmap), iterations)
@@ -216,23 +228,27 @@ def test_a_finished_run_is_the_mean_of_its_last_iterations_also_when_it_was_stop
         return config
 
     iterates: list[dict[str, torch.Tensor]] = []
-    train(
-        configured("last", 0.0),
-        lambda trainer: iterates.append(
-            {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
-        ),
-    )
+
+    def keep(trainer: SadgsTrainer) -> None:
+        params = trainer.pipeline.model.gauss_params
+        iterates.append({name: value.detach().clone() for name, value in params.items()})
+
+    train(configured("last", 0.0), keep)
     config = configured("whole", averaged / iterations)
-    config.steps_per_save, config.save_only_latest_checkpoint = stop, False
+    config.steps_per_save = stop
+    config.save_only_latest_checkpoint = False
     whole = train(config)
     for name, value in whole.pipeline.model.gauss_params.items():
         expected = torch.stack([iterate[name] for iterate in iterates[-averaged:]]).double().mean(0)
-        torch.testing.assert_close(value.detach().double(), expected, rtol=1e-5, atol=1e-5)
+        actual = value.detach().double()
+        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
     assert not torch.equal(whole.pipeline.model.means, iterates[-1]["means"])
 
-    assert checkpoint(whole, stop)["pipeline"]["_model._extra_state"]["average"]["count"] == stop + 1 - 14
+    actual = checkpoint(whole, stop)["pipeline"]["_model._extra_state"]["average"]["count"]
+    assert actual == stop + 1 - 14
     config = configured("resumed", averaged / iterations)
-    config.load_dir, config.load_step = whole.checkpoint_dir, stop
+    config.load_dir = whole.checkpoint_dir
+    config.load_step = stop
     last = iterations - 1
     assert differences(checkpoint(train(config), last), checkpoint(whole, last)) == []
 
@@ -247,7 +263,8 @@ def test_haze_is_pruned_after_densification_too_but_not_while_the_run_averages(
     monkeypatch.setattr(model_module, "HAZE_EVERY", 4)
     config = configure(tmp_path, copy.deepcopy(colmap), 20, refine_start_iter=2, refine_stop_iter=6)
     config.pipeline.model.averaged_share = 0.2  # of the iterations 17 to 20
-    arises, counts = {9, 13, 17}, [0]
+    arises = {9, 13, 17}
+    counts = [0]
 
     def add_haze(trainer: SadgsTrainer) -> None:
         model = trainer.pipeline.model
@@ -259,7 +276,8 @@ def test_haze_is_pruned_after_densification_too_but_not_while_the_run_averages(
 
     assert is_finite(train(config, add_haze).pipeline.model)
     gone = {i for i in range(7, 21) if counts[i] != counts[i - 1]}
-    assert gone == {12, 16} and counts[20] == counts[6] - 2
+    assert gone == {12, 16}
+    assert counts[20] == counts[6] - 2
 
 
 @pytest.mark.hard_case(
@@ -276,7 +294,8 @@ def test_no_gaussian_of_a_run_is_larger_than_its_distance_from_the_cameras_allow
     largest: list[float] = []
 
     def look(trainer: SadgsTrainer) -> None:
-        model, cameras = trainer.pipeline.model, trainer.pipeline.datamanager.train_dataset.cameras
+        model = trainer.pipeline.model
+        cameras = trainer.pipeline.datamanager.train_dataset.cameras
         positions = cameras.camera_to_worlds[:, :, 3].to(model.means)
         distances = (model.means.detach()[:, None] - positions).norm(dim=-1).amin(dim=1)  # [N]
         largest.append(float((model.scales.detach().exp().amax(dim=1) / distances).max()))
@@ -368,7 +387,8 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(
         result = training_step(model, groups, opacity_reg, *args)
         regularized.append(opacity_reg > 0)
         photometric = float(result.loss) - opacity_reg * opacities[-1]
-        assert 0 < photometric < 2 and opacity_reg in (0, 100)
+        assert 0 < photometric < 2
+        assert opacity_reg in (0, 100)
         return result
 
     monkeypatch.setattr("sadgs_ns.training.run.trainer.training_step", look)
@@ -387,7 +407,8 @@ def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataPar
     assert opacities.count(0.05) <= 6 * 2**2, "images of few pixels have few points on the box"
     config.pipeline.model.random_init = True
     model = set_up(config).pipeline.model
-    assert {round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()} == {0.1}
+    actual = {round(x, 4) for x in model.opacities.sigmoid().flatten().tolist()}
+    assert actual == {0.1}
 
 
 @pytest.mark.hard_case(
@@ -430,7 +451,8 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
     colmap: ColmapDataParserConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
-    launch, launched = adam.adam_step, []
+    launch = adam.adam_step
+    launched = []
     config = configure(tmp_path, colmap, 3)
     config.cuda_graphs = False  # A graph would not ask what is replaced below.
     trainer = set_up(config)  # On a GPU this launches the kernel once to compile it.
@@ -447,14 +469,17 @@ def test_a_training_step_updates_the_gaussians_in_one_launch(
     trainer.train()
     assert launched == [6] * 3
     for name, parameter in trainer.pipeline.model.gauss_params.items():
-        assert parameter.isfinite().all() and (name == "features_rest" or not torch.equal(parameter, before[name]))
+        assert parameter.isfinite().all()
+        assert name == "features_rest" or not torch.equal(parameter, before[name])
 
 
 def test_the_position_rate_grows_with_the_cameras_extent(colmap: ColmapDataParserConfig, tmp_path: Path):
     trainer = set_up(configure(tmp_path, colmap))
     extent = trainer.pipeline.model.strategy_state["scene_scale"]
     assert extent != pytest.approx(1.0)
-    assert trainer.optimizers.schedulers["means"].get_last_lr() == pytest.approx([RATES["means"][0] * extent])
+    actual = trainer.optimizers.schedulers["means"].get_last_lr()
+    expected = pytest.approx([RATES["means"][0] * extent])
+    assert actual == expected
 
 
 def test_the_seed_decides_the_order_of_the_views(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -463,7 +488,8 @@ def test_the_seed_decides_the_order_of_the_views(colmap: ColmapDataParserConfig,
         config = configure(tmp_path, colmap)
         config.machine.seed = seed
         orders.append(set_up(config).pipeline.views.sampler.draw(TRAIN_VIEWS))
-    assert orders[0] != orders[1] == orders[2] and sorted(orders[0]) == sorted(orders[1])
+    assert orders[0] != orders[1] == orders[2]
+    assert sorted(orders[0]) == sorted(orders[1])
 
 
 # --- checkpoints ---
@@ -563,7 +589,8 @@ def test_the_loss_of_views_is_the_mean_of_their_own(tmp_path: Path, poses: Any):
     alone = [loss(index) for index in range(5)]
     assert len({round(float(value), 4) for value in alone}) == 5
     for indices in [(0, 2), (3, 1), (0, 1), (4, 1, 2)]:
-        torch.testing.assert_close(loss(*indices), torch.stack([alone[i] for i in indices]).mean(), rtol=1e-5, atol=0)
+        expected = torch.stack([alone[i] for i in indices]).mean()
+        torch.testing.assert_close(loss(*indices), expected, rtol=1e-5, atol=0)
 
 
 def test_images_in_bytes_become_what_two_operations_made_of_them(tmp_path: Path, colmap: ColmapDataParserConfig):
@@ -590,7 +617,8 @@ def test_masked_pixels_have_no_structure_tensor_and_no_part_in_the_loss(tmp_path
         return pipeline.model.get_loss_dict({"rgb": rgb, "background": background}, data)["main_loss"]
 
     rgb = torch.rand((HEIGHT, WIDTH, 3), device=pipeline.device)
-    left, right = rgb.clone(), rgb.clone()
+    left = rgb.clone()
+    right = rgb.clone()
     left[:, : WIDTH // 2] += 0.3
     right[:, WIDTH // 2 :] += 0.3
     assert loss(left) == loss(rgb) != loss(right)
@@ -602,11 +630,13 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     config.pipeline.model.background_color = "white"
     config.pipeline.model.random_init = True
     trainer = set_up(config)
-    model, data = trainer.pipeline.model, trainer.pipeline.datamanager.cached_train[0]
+    model = trainer.pipeline.model
+    data = trainer.pipeline.datamanager.cached_train[0]
     assert data["image"].shape[-1] == 4
     white = torch.ones(3, device=model.device)
     target = model.composite_with_background(data["image"].to(model.device) / 255, white)
-    assert (target[:, : WIDTH // 2] == 1).all() and target[:, WIDTH // 2 :].amin() < 1
+    assert (target[:, : WIDTH // 2] == 1).all()
+    assert target[:, WIDTH // 2 :].amin() < 1
     model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
     torch.testing.assert_close(trainer.pipeline.structure_cache.photo(data), target)
     trainer.train()
@@ -616,7 +646,8 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
 def test_blender_data_train_with_the_alpha_colour_that_its_parser_gives_them(tmp_path: Path):
     trainer = train(configure(tmp_path / "out", blender_data(tmp_path / "data", alpha_color="white")))
     image = trainer.pipeline.datamanager.cached_train[0]["image"]
-    assert image.shape[-1] == 3 and (image[:, : WIDTH // 2] == 255).all()
+    assert image.shape[-1] == 3
+    assert (image[:, : WIDTH // 2] == 255).all()
     assert is_finite(trainer.pipeline.model)
 
 
@@ -657,9 +688,9 @@ def test_held_out_cameras_render_as_nerfstudio_expects(trained: SadgsTrainer):
         camera = pipeline.datamanager.eval_dataset.cameras[index : index + 1]
         outputs = pipeline.model.get_outputs_for_camera(camera)
         channels = {"rgb": 3, "depth": 1, "accumulation": 1, "background": 3, "normals": 3}
-        assert {name: tuple(value.shape) for name, value in outputs.items()} == {
-            name: (HEIGHT, WIDTH, count) for name, count in channels.items()
-        }
+        actual = {name: tuple(value.shape) for name, value in outputs.items()}
+        expected = {name: (HEIGHT, WIDTH, count) for name, count in channels.items()}
+        assert actual == expected
         assert 0 <= outputs["rgb"].min() < outputs["rgb"].max() <= 1
         assert outputs["depth"].min() > 0
 
@@ -670,7 +701,8 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
     stored = torch.load(path, weights_only=True)["pipeline"]["_extra_state"]["plan"]["near_plane"]
     _, pipeline, _, _ = eval_setup(finished / "config.yml")
     model: Any = pipeline.model
-    assert isinstance(model, SadgsModel) and model.config.near_plane == "viewers"
+    assert isinstance(model, SadgsModel)
+    assert model.config.near_plane == "viewers"
     assert model.plan.near_plane == stored == NEAR_PLANE
     datamanager: Any = pipeline.datamanager
     cameras = datamanager.train_dataset.cameras
@@ -704,12 +736,16 @@ def test_after_the_viewer_has_rendered_the_whole_model_trains_again(trained: Sad
     pipeline = trained.pipeline
     pipeline.train()
     pipeline.model.eval()  # as nerfstudio's viewer does
-    assert pipeline.train() is pipeline and all(module.training for module in pipeline.modules())
-    assert not any(module.training for module in pipeline.eval().modules())
+    assert pipeline.train() is pipeline
+    for module in pipeline.modules():
+        assert module.training
+    for module in pipeline.eval().modules():
+        assert not module.training
 
 
 def test_a_crop_box_hides_what_lies_outside(trained: SadgsTrainer):
-    model, camera = trained.pipeline.model, trained.pipeline.datamanager.eval_dataset.cameras[:1]
+    model = trained.pipeline.model
+    camera = trained.pipeline.datamanager.eval_dataset.cameras[:1]
 
     def accumulation(x: float) -> torch.Tensor:
         """Of what lies in a box of side 1,000 around (x, 0, 0)."""

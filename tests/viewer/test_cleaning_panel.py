@@ -54,7 +54,8 @@ def test_the_viewer_finds_the_elements(pipeline: SadgsPipeline):
 
 @torch.no_grad()
 def test_the_preview_draws_what_stays_and_what_goes_and_takes_nothing(pipeline: SadgsPipeline):
-    panel, model = pipeline.cleaning, pipeline.model
+    panel = pipeline.cleaning
+    model = pipeline.model
     before = {name: value.clone() for name, value in model.gauss_params.items()}
     rgb, picture = shown(pipeline)
     assert torch.equal(rgb, picture), "off"
@@ -67,7 +68,9 @@ def test_the_preview_draws_what_stays_and_what_goes_and_takes_nothing(pipeline: 
     rgb, kept = shown(pipeline)
     set_to(panel, choice=GOES)
     _, gone = shown(pipeline)
-    assert not torch.equal(rgb, kept) and not torch.equal(rgb, gone) and not torch.equal(kept, gone)
+    assert not torch.equal(rgb, kept)
+    assert not torch.equal(rgb, gone)
+    assert not torch.equal(kept, gone)
     for name, value in before.items():
         assert torch.equal(value, model.gauss_params[name])
         model.gauss_params[name].data = value[stays]
@@ -79,7 +82,8 @@ def test_the_preview_draws_what_stays_and_what_goes_and_takes_nothing(pipeline: 
 def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     pipeline: SadgsPipeline, monkeypatch: pytest.MonkeyPatch
 ):
-    panel, model = pipeline.cleaning, pipeline.model
+    panel = pipeline.cleaning
+    model = pipeline.model
     looks: list[Any] = []
 
     def look(params: Any, cameras: Any, drawing: Any) -> Any:

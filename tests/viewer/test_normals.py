@@ -48,18 +48,21 @@ def test_a_normal_is_the_thinnest_axis_turned_towards_the_camera():
         seen = normals_map(discs([angle]), Cameras(viewmats, Ks, 64, 48))
         facing = math.atan(math.tan(angle))  # A disc that is turned by π faces the camera again.
         expected = torch.tensor([-math.sin(facing), 0.0, -math.cos(facing)])
-        torch.testing.assert_close(seen[24, 32], expected, atol=1e-5, rtol=0)
+        actual = seen[24, 32]
+        torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
         assert (seen[0, 0] == 0).all(), "nothing is there"
 
 
 def test_normals_are_in_the_world_s_axes_and_of_unit_length():
     """The camera and what it sees are turned together: what it sees is the same, and its normals are turned."""
     viewmats, Ks = camera(64, 48)
-    plain, turn = discs([0.3, -0.5]), torch.tensor(1.1)
+    plain = discs([0.3, -0.5])
+    turn = torch.tensor(1.1)
     rotation = torch.tensor([[turn.cos(), -turn.sin(), 0], [turn.sin(), turn.cos(), 0], [0, 0, 1]])
     about_z = torch.tensor([(turn / 2).cos(), 0, 0, (turn / 2).sin()])
     w, x, y, z = plain["quats"].unbind(-1)
-    a, d = about_z[0], about_z[3]
+    a = about_z[0]
+    d = about_z[3]
     turned = plain | {
         "means": plain["means"] @ rotation.T,
         "quats": torch.stack([a * w - d * z, a * x - d * y, a * y + d * x, a * z + d * w], dim=-1),
@@ -70,7 +73,9 @@ def test_normals_are_in_the_world_s_axes_and_of_unit_length():
     after = normals_map(turned, Cameras(viewmat[None], Ks, 64, 48))
     torch.testing.assert_close(after, before @ rotation.T, atol=1e-4, rtol=0)
     lengths = before.norm(dim=-1)
-    torch.testing.assert_close(lengths[lengths > 0], torch.ones_like(lengths[lengths > 0]))
+    actual = lengths[lengths > 0]
+    expected = torch.ones_like(lengths[lengths > 0])
+    torch.testing.assert_close(actual, expected)
     assert 0 < (lengths == 0).sum() < lengths.numel()
 
 
@@ -82,11 +87,16 @@ def test_what_is_read_later_is_computed_once_and_only_then():
         return torch.ones(2)
 
     outputs = LazyOutputs({"rgb": torch.zeros(2), "normals": normals})
-    assert "normals" in outputs and list(outputs) == list(outputs.keys()) == ["rgb", "normals"]
+    assert "normals" in outputs
+    assert list(outputs) == list(outputs.keys()) == ["rgb", "normals"]
     outputs["rgba"] = outputs["rgb"]
-    assert len(outputs) == 3 and not calls
-    assert torch.equal(outputs["normals"], torch.ones(2)) and outputs.get("normals") is outputs["normals"]
-    assert all(isinstance(value, torch.Tensor) for value in outputs.values()) and calls == ["normals"]
+    assert len(outputs) == 3
+    assert not calls
+    assert torch.equal(outputs["normals"], torch.ones(2))
+    assert outputs.get("normals") is outputs["normals"]
+    for value in outputs.values():
+        assert isinstance(value, torch.Tensor)
+    assert calls == ["normals"]
 
 
 @pytest.fixture
@@ -97,7 +107,8 @@ def trainer(config: SadgsTrainerConfig) -> SadgsTrainer:
 @pytest.fixture
 def counted(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
     """How often normals were rendered."""
-    calls, render = [0], SadgsModel.get_normals
+    calls = [0]
+    render = SadgsModel.get_normals
 
     def get_normals(*args: Any) -> torch.Tensor:
         calls[0] += 1
@@ -116,12 +127,18 @@ def test_evaluation_renders_no_normals_and_who_reads_them_gets_pictures(
     pipeline.get_average_eval_image_metrics()
     view = pipeline.datamanager.train_dataset.cameras[:1]
     outputs = model.get_outputs_for_camera(view)
-    assert counted() == 0 and list(outputs)[:3] == ["rgb", "depth", "accumulation"] and NORMALS in outputs
+    assert counted() == 0
+    assert list(outputs)[:3] == ["rgb", "depth", "accumulation"]
+    assert NORMALS in outputs
     normals = outputs[NORMALS].cpu()
-    assert counted() == 1 and normals.shape == (HEIGHT, WIDTH, 3)
+    assert counted() == 1
+    assert normals.shape == (HEIGHT, WIDTH, 3)
     drawn = outputs["accumulation"][..., 0].cpu() > 0
-    assert (normals[~drawn] == 0).all() and drawn.any()
-    torch.testing.assert_close((2 * normals[drawn] - 1).norm(dim=-1), torch.ones(int(drawn.sum())), atol=1e-4, rtol=0)
+    assert (normals[~drawn] == 0).all()
+    assert drawn.any()
+    actual = (2 * normals[drawn] - 1).norm(dim=-1)
+    expected = torch.ones(int(drawn.sum()))
+    torch.testing.assert_close(actual, expected, atol=1e-4, rtol=0)
     towards = view.camera_to_worlds[0, :, 2].to(normals)  # against the direction of view
     assert ((2 * normals[drawn] - 1) @ towards > 0).float().mean() > 0.9
 
@@ -131,7 +148,8 @@ def test_normals_are_of_the_gaussians_that_the_crop_box_shows(trainer: SadgsTrai
     trainer.pipeline.eval()
     view = trainer.pipeline.datamanager.train_dataset.cameras[:1]
     box = OrientedBox(torch.eye(3), model.means.detach().cpu().median(dim=0).values, torch.full((3,), 0.4))
-    cropped, whole = model.get_outputs_for_camera(view, box), model.get_outputs_for_camera(view)
+    cropped = model.get_outputs_for_camera(view, box)
+    whole = model.get_outputs_for_camera(view)
     assert ((cropped[NORMALS] > 0).any(dim=-1) == (cropped["accumulation"][..., 0] > 0)).all()
     assert not torch.equal(cropped[NORMALS], whole[NORMALS])
     nothing = OrientedBox(torch.eye(3), torch.full((3,), 1e3), torch.ones(3))
@@ -149,11 +167,15 @@ def test_the_viewer_renders_normals_only_where_it_shows_them(trainer: SadgsTrain
         return in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(view))
 
     outputs = seen()
-    assert isinstance(outputs, dict) and torch.equal(outputs[NORMALS], outputs["rgb"]) and counted() == 0
+    assert isinstance(outputs, dict)
+    assert torch.equal(outputs[NORMALS], outputs["rgb"])
+    assert counted() == 0
     panel.output_render = NORMALS
     outputs = seen()
-    assert not torch.equal(outputs[NORMALS], outputs["rgb"]) and counted() == 1
-    panel.output_render, panel.split = "depth", True
+    assert not torch.equal(outputs[NORMALS], outputs["rgb"])
+    assert counted() == 1
+    panel.output_render = "depth"
+    panel.split = True
     seen()
     assert counted() == 2
     assert not shows_output(SimpleNamespace(), NORMALS)  # type: ignore[arg-type]  # before there is a viewer
@@ -161,7 +183,8 @@ def test_the_viewer_renders_normals_only_where_it_shows_them(trainer: SadgsTrain
 
 def test_ns_render_writes_depth_and_normals(trainer: SadgsTrainer, tmp_path: Path, counted: Callable[[], int]):
     trainer.save_checkpoint(0)
-    config, output = write_config(trainer.config), tmp_path / "renders"
+    config = write_config(trainer.config)
+    output = tmp_path / "renders"
     command = DatasetRender(config, output_path=output, image_format="png")
     command.rendered_output_names = ["rgb", "depth"]
     command.main()
@@ -171,7 +194,8 @@ def test_ns_render_writes_depth_and_normals(trainer: SadgsTrainer, tmp_path: Pat
     pictures = sorted((output / "test/normals").iterdir())
     assert counted() == len(pictures) == len(list((output / "test/raw-depth").iterdir())) > 0
     with Image.open(pictures[0]) as picture:
-        assert picture.size == (WIDTH, HEIGHT) and np.asarray(picture).max() > 128
+        assert picture.size == (WIDTH, HEIGHT)
+        assert np.asarray(picture).max() > 128
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -26,7 +26,7 @@ def test_the_table_leaves_out_no_change_of_the_number_of_gaussians():
     """What AbsGS added between the structure steps, and since, has a row; where there was no change there is none."""
     steps = [structure_step(500, 1000, 2000), structure_step(1000, 2600, 4000), structure_step(1500, 4000, 5000)]
     text = describe(StructureAwareStrategy(max_gaussians=9000), 4800, {"structure_steps": steps})
-    assert text.splitlines() == [
+    expected = [
         "**4,800 Gaussians** (cap 9,000)",
         "",
         "| iteration | step | violate | low | Gaussians |",
@@ -37,12 +37,14 @@ def test_the_table_leaves_out_no_change_of_the_number_of_gaussians():
         "| 1500 | structure | 7 | 3 | 4,000 → 5,000 |",
         "| since 1500 | AbsGS, pruning | | | 5,000 → 4,800 |",
     ]
+    assert text.splitlines() == expected
 
 
 def test_the_table_shows_the_last_steps():
     steps = [structure_step(i, i, i + 1) for i in range(1, 30)]
     rows = describe(StructureAwareStrategy(), 30, {"structure_steps": steps}).splitlines()[4:]
-    assert len(rows) == ROWS and rows[-1].startswith("| 29 ")
+    assert len(rows) == ROWS
+    assert rows[-1].startswith("| 29 ")
 
 
 class Handle:
@@ -86,17 +88,19 @@ def test_observing_all_training_views_tells_how_far_it_is_and_what_was_seen(
 ):
     clock = iter(range(1000))
     monkeypatch.setattr(panel_module.time, "monotonic", lambda: next(clock))
-    panel, views = pipeline.structure, len(pipeline.views)
+    panel = pipeline.structure
+    views = len(pipeline.views)
     panel.observe.cb_hook(panel.observe)
     statistics = panel.statistics()
     assert statistics is not None
     seen = int((statistics["n_total"] > 0).sum())
-    assert told(panel) == [
+    expected = [
         "Reading the training photos and their texture …",
         *(f"Observing training view {view + 1} of {views} …" for view in range(views)),
         f"Observed {views} training views, which see {seen:,} Gaussians: “η”, “children” and “low” show what was "
         "found.",
     ]
+    assert told(panel) == expected
     assert was_disabled(panel) == [True, False], "the button cannot be pressed meanwhile"
     panel.choice.value = "wavelength of the nearest photo"
     panel.choice.cb_hook(panel.choice)

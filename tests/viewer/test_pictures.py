@@ -21,7 +21,8 @@ from sadgs_ns.render.types import Cameras
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel
 
-WIDTH, HEIGHT = 128, 96
+WIDTH = 128
+HEIGHT = 96
 
 
 def grating(period: float, angle: float = 0.0) -> torch.Tensor:
@@ -64,7 +65,8 @@ def test_without_texture_there_is_no_wavelength_and_no_ellipse():
     flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
     period = maps.texture_period(structure_tensor(flat))
     assert period.isnan().all()
-    assert (PERIOD(period) == PERIOD(period)[0, 0]).all() and PERIOD(period)[0, 0].tolist() == [0, 0, 0]
+    assert (PERIOD(period) == PERIOD(period)[0, 0]).all()
+    assert PERIOD(period)[0, 0].tolist() == [0, 0, 0]
     assert len(maps.structure_ellipses(structure_tensor(flat)).centers) == 0
     drawn = maps.draw_ellipses(color_scales.to_picture(flat), structure_tensor(flat), 0.75, (HEIGHT, WIDTH))
     assert len(np.unique(drawn)) == 1
@@ -72,13 +74,16 @@ def test_without_texture_there_is_no_wavelength_and_no_ellipse():
 
 def test_masked_pixels_are_drawn_as_those_without_texture():
     """The left half is masked: it is black in the map of periods and has no ellipses; the right half has both."""
-    image, mask = grating(8.0), torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
+    image = grating(8.0)
+    mask = torch.ones((1, HEIGHT, WIDTH), dtype=torch.bool)
     mask[:, :, : WIDTH // 2] = False
     tensor = multiscale_structure_tensor(image[None], mask)[0]
     shown = PERIOD(maps.texture_period(tensor))
-    assert not shown[:, : WIDTH // 2].any() and shown[:, WIDTH // 2 :].any(axis=-1).all()
+    assert not shown[:, : WIDTH // 2].any()
+    assert shown[:, WIDTH // 2 :].any(axis=-1).all()
     ellipses = maps.structure_ellipses(tensor)
-    assert len(ellipses.centers) > 0 and ellipses.centers[:, 0].min() > WIDTH / 2
+    assert len(ellipses.centers) > 0
+    assert ellipses.centers[:, 0].min() > WIDTH / 2
     assert len(maps.structure_ellipses(torch.full_like(tensor, torch.nan)).centers) == 0
     maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, (HEIGHT, WIDTH))
 
@@ -103,7 +108,8 @@ def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatc
         patched.setattr(maps, "ELLIPSES_ACROSS", 1)
         ellipses = maps.structure_ellipses(tensor, 0.4)
     assert ellipses.centers.tolist() == [[20.0, 20.0]]
-    torch.testing.assert_close(ellipses.axes, torch.tensor([[2.5, 12.5]], dtype=torch.float64), rtol=1e-3, atol=0)
+    expected = torch.tensor([[2.5, 12.5]], dtype=torch.float64)
+    torch.testing.assert_close(ellipses.axes, expected, rtol=1e-3, atol=0)
     tensor[:] = tensor[20, 20]
     drawn = maps.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, 0.4, size=(1120, 1120))
     cell = drawn[520:560, 520:560]  # 28 ellipses across: cells of 40 px
@@ -116,15 +122,19 @@ def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatc
 def test_images_of_any_size_can_be_drawn(size: tuple[int, int]):
     image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0))
     tensor = structure_tensor(image)
-    assert maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, size).shape == (*size, 3)
+    actual = maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, size).shape
+    assert actual == (*size, 3)
     assert PERIOD(maps.texture_period(tensor)).shape == (*size, 3)
 
 
 def test_eta_is_colored_around_one():
     violet, white, orange = ETA(torch.tensor([[0.1, 1.0, 10.0]]))[0].astype(int)
-    assert violet[2] > violet[1] and orange[0] > orange[2]
+    assert violet[2] > violet[1]
+    assert orange[0] > orange[2]
     assert white.min() > 240
-    assert ETA(torch.tensor([[1e-9, 1e9]])).tolist() == ETA(torch.tensor([[ETA.low, ETA.high]])).tolist()
+    actual = ETA(torch.tensor([[1e-9, 1e9]])).tolist()
+    expected = ETA(torch.tensor([[ETA.low, ETA.high]])).tolist()
+    assert actual == expected
 
 
 @pytest.mark.parametrize("scale", [PERIOD, ETA, CHILDREN, LOW], ids=lambda scale: scale.colors)
@@ -148,20 +158,24 @@ def test_each_gaussian_has_its_own_eta_and_unobserved_ones_none():
 def test_children_and_low_gaussians_are_seen_where_they_are():
     counts = torch.tensor([[2, 3, 1], [1, 1, 1]])
     children = maps.children_map(wall(), counts, view())
-    assert float(children[24, 17]) == pytest.approx(6.0, rel=1e-3) and float(children[24, 47]) == pytest.approx(1.0)
+    assert float(children[24, 17]) == pytest.approx(6.0, rel=1e-3)
+    assert float(children[24, 47]) == pytest.approx(1.0)
     low = maps.mean_map(wall(), torch.tensor([0.0, 1.0]), view())
-    assert float(low[24, 17]) == pytest.approx(0.0) and float(low[24, 47]) == pytest.approx(1.0)
+    assert float(low[24, 17]) == pytest.approx(0.0)
+    assert float(low[24, 47]) == pytest.approx(1.0)
     assert CHILDREN(children).shape == LOW(low).shape == (48, 64, 3)
 
 
 def test_only_children_get_new_colors():
     generator = torch.Generator().manual_seed(0)
     colors = maps.random_colors(4, generator)
-    assert (colors.amax(dim=1) >= 0.5).all() and len(colors.unique(dim=0)) == 4
+    assert (colors.amax(dim=1) >= 0.5).all()
+    assert len(colors.unique(dim=0)) == 4
     origins = torch.tensor([0, 3, 1, 1, 1])  # 2 was pruned, 1 split in three
     after = maps.recolor(colors, origins, generator)
     assert torch.equal(after[:2], colors[[0, 3]])
-    assert not (after[2:, None] == colors[None]).all(dim=-1).any() and len(after.unique(dim=0)) == 5
+    assert not (after[2:, None] == colors[None]).all(dim=-1).any()
+    assert len(after.unique(dim=0)) == 5
 
 
 def pixels_of(scale: color_scales.Scale) -> np.ndarray:
@@ -199,5 +213,7 @@ def test_blending_agrees_with_the_splatter_s_colors():
     colors = torch.rand((50, 3), generator=torch.Generator().manual_seed(1))
     render, cover = blend(params, colors, view())
     ones, _ = blend(params, torch.ones(50, 3), view())
-    torch.testing.assert_close(ones, cover.expand(-1, -1, 3))
-    assert render.shape == (48, 64, 3) and (render <= ones + 1e-6).all()
+    expected = cover.expand(-1, -1, 3)
+    torch.testing.assert_close(ones, expected)
+    assert render.shape == (48, 64, 3)
+    assert (render <= ones + 1e-6).all()

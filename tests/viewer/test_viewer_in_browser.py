@@ -74,7 +74,8 @@ def test_the_panel_shows_and_sets_what_is_chosen_in_a_browser(tmp_path: Path):
             assert not page.run(f"!!{LEGEND}")
             select(page, "Show", "η")
             page.wait_for(f"{ELEMENT.format('Output type')}.value == '{OUTPUT}'")
-            assert panel.choice.value == "η" and panel.statistics() is not None
+            assert panel.choice.value == "η"
+            assert panel.statistics() is not None
             width = page.wait_for(f"!!{LEGEND} && {LEGEND}.getBoundingClientRect().width")
             assert 200 < width <= 720, "the numbers are sharp: it is not enlarged"
             assert "over 1 violates" in page.run("document.body.innerText")

@@ -72,7 +72,8 @@ def test_tile_lists_are_tried_in_the_size_of_the_run(config: SadgsTrainerConfig,
         monkeypatch.setattr(stages, name, None)  # the stages that need a GPU end at once
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
     cameras = trainer.pipeline.datamanager.train_dataset.cameras
-    assert (int(cameras.width.max()), int(cameras.height.max())) in sizes and (64, 64) in sizes
+    assert (int(cameras.width.max()), int(cameras.height.max())) in sizes
+    assert (64, 64) in sizes
     trainer.shutdown()
 
 
@@ -107,12 +108,14 @@ def test_what_cannot_be_compiled_leaves_the_run_as_it_was(
     parameters = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
     random_state = torch.get_rng_state()
     compilation.compile_kernels(trainer.pipeline, trainer.optimizers.optimizers)
-    assert sorted(launched) == [*["activate"] * 2, "adam_step", *["photometric_loss"] * 2, "quantize", "rasterize"]
+    expected = [*["activate"] * 2, "adam_step", *["photometric_loss"] * 2, "quantize", "rasterize"]
+    assert sorted(launched) == expected
     output = capsys.readouterr().out
     assert "The kernels of rasterization could not be compiled and tried before training (no compiler)" in output
     assert torch.equal(torch.get_rng_state(), random_state)
     assert all(torch.equal(trainer.pipeline.model.gauss_params[name], value) for name, value in parameters.items())
-    assert all(not optimizer.state for optimizer in trainer.optimizers.optimizers.values())
+    for optimizer in trainer.optimizers.optimizers.values():
+        assert not optimizer.state
     trainer.shutdown()
 
 

@@ -80,7 +80,8 @@ def test_a_run_launches_nothing_that_was_not_compiled_ahead(tmp_path: Path):
     ahead = run_with_the_compiler(tmp_path, AHEAD, str(tmp_path / "marker"))
     assert ahead.returncode == 0, ahead.stderr[-3000:]
     told = ahead.stdout.splitlines()
-    assert len(told) > 20 and told == [f"{done} of {len(told)}" for done in range(1, len(told) + 1)]
+    assert len(told) > 20
+    assert told == [f"{done} of {len(told)}" for done in range(1, len(told) + 1)]
     assert (tmp_path / "marker").exists()
     run = run_with_the_compiler(tmp_path, RUN)
     assert run.returncode == 0, run.stderr[-3000:]
@@ -120,7 +121,8 @@ def test_where_a_kernel_does_not_compile_the_next_run_tries_again(tmp_path: Path
     pytest.importorskip("triton", reason="Triton is not installed")
     fail = "compile_ahead.find_kernels = lambda: compile_ahead._found.append((None, None, {}))\n"
     run = run_with_the_compiler(tmp_path, f"{IDLE_DRIVER}{fail}compile_ahead.main()", str(tmp_path / "marker"))
-    assert run.returncode != 0 and not (tmp_path / "marker").exists()
+    assert run.returncode != 0
+    assert not (tmp_path / "marker").exists()
 
 
 SLOW = """
@@ -146,11 +148,14 @@ def test_no_process_outlives_the_run(tmp_path: Path, first_is_killed: bool):
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
     with compiler:
-        assert compiler.stdin and compiler.stdout and compiler.stderr
+        assert compiler.stdin
+        assert compiler.stdout
+        assert compiler.stderr
         assert compiler.stderr.read(2) == b"xx", "both are at work"
         if first_is_killed:
             compiler.kill()
-            assert select.select([compiler.stdout], [], [], 60)[0] and not compiler.stdout.read(), "the run knows it"
+            assert select.select([compiler.stdout], [], [], 60)[0], "the run knows it"
+            assert not compiler.stdout.read(), "the run knows it"
         compiler.stdin.close()
         assert compiler.wait(60) == -signal.SIGKILL
         assert not compiler.stderr.read(), "this ends when nobody holds the other end any more"

@@ -166,7 +166,8 @@ def test_options_with_which_no_run_can_work_are_refused_before_anything_is_writt
     setattr(owner, name, value)
     with pytest.raises(InputError) as refused:
         config.save_config()
-    assert str(refused.value).startswith(sentence) and "\n" not in str(refused.value)
+    assert str(refused.value).startswith(sentence)
+    assert "\n" not in str(refused.value)
     assert not config.output_dir.exists()
 
 
@@ -203,7 +204,9 @@ def test_a_scene_in_tiny_units_is_seen_since_its_near_plane_is_in_them(config: S
     assert set_up(config).pipeline.model.plan.near_plane == NEAR_PLANE < plane
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, scale_factor=1e-4)
-    assert set_up(config).pipeline.model.plan.near_plane == pytest.approx(1e-4 * plane, rel=1e-3)
+    actual = set_up(config).pipeline.model.plan.near_plane
+    expected = pytest.approx(1e-4 * plane, rel=1e-3)
+    assert actual == expected
 
 
 @pytest.mark.hard_case(
@@ -227,7 +230,8 @@ def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: Sadg
         config.vis = "tensorboard"
         config.save_config()
         shutil.rmtree(config.output_dir)
-    config.vis, config.viewer.websocket_port = "viewer_legacy", None
+    config.vis = "viewer_legacy"
+    config.viewer.websocket_port = None
     config.viewer.websocket_host = "192.0.2.1"  # an address that no machine has
     assert re.search(
         r"^The viewer cannot listen on 192\.0\.2\.1 \(.+\): give another .*viewer\.websocket_host", refused()
@@ -247,7 +251,8 @@ def test_a_viewer_that_cannot_listen_where_it_is_told_to_is_refused(config: Sadg
 def test_options_beside_a_config_that_nerfstudio_would_not_read_are_refused(
     config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    preset, file = sadgs.config, write_config(config)
+    preset = sadgs.config
+    file = write_config(config)
     dataclasses.replace(preset, load_config=file).print_to_terminal()
     assert capsys.readouterr().out == ""
     with pytest.raises(InputError) as refused:
@@ -478,7 +483,8 @@ def test_a_checkpoint_that_is_none_is_refused_before_anything_is_written(
     spoil, sentence = CHECKPOINTS[case]
     (tmp_path / "models").mkdir()
     spoil(Path(shutil.copy(saved, tmp_path / "models")))
-    config.load_dir, config.output_dir = tmp_path / "models", tmp_path / "out"
+    config.load_dir = tmp_path / "models"
+    config.output_dir = tmp_path / "out"
     with pytest.raises(InputError) as refused:
         config.save_config()
     assert re.fullmatch(sentence, str(refused.value)), str(refused.value)
@@ -543,7 +549,8 @@ def poison(trainer: SadgsTrainer, what: str) -> None:
     """Let every loss, or every gradient of means, be NaN from now on; or the gradient of the first Gaussian alone."""
     trainer.graphed = None  # A graph repeats what was launched before it was poisoned.
     model = trainer.pipeline.model
-    before_background, gaussians = model.before_background, model.gaussians
+    before_background = model.before_background
+    gaussians = model.gaussians
     rows = slice(None) if what == "gradients" else slice(1)
 
     def spoil(gradient: torch.Tensor) -> torch.Tensor:
@@ -571,7 +578,8 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
     what: str, config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
     monkeypatch.setattr(nonfinite, "DIVERGED_STEPS", 8)
-    config.max_num_iterations, config.steps_per_save = 24, 3
+    config.max_num_iterations = 24
+    config.steps_per_save = 3
     config.pipeline.model.strategy.refine_stop_iter = 0
     trainer = set_up(config)
     trainer.pipeline.log.capacity = 4  # read every 4 iterations
@@ -592,7 +600,8 @@ def test_a_run_that_learns_nothing_stops_with_one_sentence_and_a_finite_checkpoi
     state = checkpoint(trainer, 15)
     assert all(v.isfinite().all() for k, v in state["pipeline"].items() if "gauss_params" in k)
     assert (trainer.checkpoint_dir / "step-000000012.ckpt").exists()  # it may be the better one
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
     assert is_finite(train(config).pipeline.model)
 
 
@@ -630,7 +639,8 @@ def test_one_gaussian_whose_gradient_is_always_nan_stops_nobody(
     trainer = set_up(config)
     poison(trainer, "one gradient")
     trainer.train()
-    assert "gradients were not finite" in capsys.readouterr().out and is_finite(trainer.pipeline.model)
+    assert "gradients were not finite" in capsys.readouterr().out
+    assert is_finite(trainer.pipeline.model)
 
 
 # --- the GPU's memory ---
@@ -658,7 +668,8 @@ def fail_at(trainer: SadgsTrainer, step: int) -> None:
 )
 @pytest.mark.parametrize("steps", [0, 2])
 def test_full_memory_ends_the_run_with_a_sentence_that_says_what_helps(steps: int, config: SadgsTrainerConfig):
-    config.steps_per_save, config.seconds_per_save = steps, 0
+    config.steps_per_save = steps
+    config.seconds_per_save = 0
     trainer = set_up(config)
     fail_at(trainer, 4)
     with pytest.raises(RunError) as stopped:

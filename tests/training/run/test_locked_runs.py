@@ -33,7 +33,8 @@ def used_by_another_process(path: Path) -> Iterator[None]:
     """Let another process hold the lock of a folder or file."""
     command = [sys.executable, "-c", _HOLD, str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdin is not None and process.stdout is not None
+        assert process.stdin is not None
+        assert process.stdout is not None
         process.stdout.readline()
         yield
         process.stdin.close()

@@ -43,7 +43,9 @@ from sadgs_ns.training.run.memory_plan import (
 )
 
 DEFAULT = StructureAwareStrategy.max_gaussians
-WIDTH, HEIGHT, VIEWS = 48, 36, 10
+WIDTH = 48
+HEIGHT = 36
+VIEWS = 10
 KEPT = 4 * 4 * 59 + 4 * (3 + 3 + 3 + 1 + 3)
 """Of a Gaussian: parameter, gradient, two moments; three statistics an axis, a count, three of AbsGS."""
 WIDEST = 4 * 45
@@ -105,19 +107,27 @@ def test_each_phase_counts_what_it_grows_with():
     def peak(n: int = 1000, views: int = 1, pixels: int = 10**6, pairs: int = 10**5) -> dict[str, float]:
         return step_memory.step_bytes(n, StepSize(views, pixels, pairs), torch.device("cpu"))
 
-    assert all(peak(n=2000)[name] > value for name, value in peak().items())
-    assert all(peak(views=4)[name] > value for name, value in peak().items())
-    assert all(peak(pairs=10**7)[name] > value for name, value in peak().items())
-    assert max(peak(pixels=10**7), key=peak(pixels=10**7).__getitem__) == "loss"
-    assert max(peak(pairs=10**8), key=peak(pairs=10**8).__getitem__) == "tile lists"
-    assert max(peak(n=10**7), key=peak(n=10**7).__getitem__) == "backward"
+    for name, value in peak().items():
+        assert peak(n=2000)[name] > value
+    for name, value in peak().items():
+        assert peak(views=4)[name] > value
+    for name, value in peak().items():
+        assert peak(pairs=10**7)[name] > value
+    actual = max(peak(pixels=10**7), key=peak(pixels=10**7).__getitem__)
+    assert actual == "loss"
+    actual = max(peak(pairs=10**8), key=peak(pairs=10**8).__getitem__)
+    assert actual == "tile lists"
+    actual = max(peak(n=10**7), key=peak(n=10**7).__getitem__)
+    assert actual == "backward"
 
 
 @pytest.mark.hard_case("several views a step", "the memory plan leaves room for fewer Gaussians")
 def test_several_views_leave_room_for_fewer_gaussians(card: Any):
     card(5, 6)
-    one, four = fit(views=1, pixels=6_500_000)[0], fit(views=4, pixels=4 * 6_500_000)[0]
-    assert one == int(4e9 // each(1)) and four < 0.5 * one
+    one = fit(views=1, pixels=6_500_000)[0]
+    four = fit(views=4, pixels=4 * 6_500_000)[0]
+    assert one == int(4e9 // each(1))
+    assert four < 0.5 * one
     assert fit(views=4)[0] == int(4e9 // each(4))
 
 
@@ -153,14 +163,16 @@ def test_a_budget_bounds_it_and_never_raises_max_gaussians(card: Any):
 def test_a_cap_that_the_user_chose_stays_without_a_budget(card: Any):
     card(2, 8)
     cap, line = fit(cap=1_000_000)
-    assert cap == 1_000_000 and line.startswith("At most 1,000,000 Gaussians: 1.8 GB of the card's 8.0 GB.")
+    assert cap == 1_000_000
+    assert line.startswith("At most 1,000,000 Gaussians: 1.8 GB of the card's 8.0 GB.")
 
 
 @pytest.mark.hard_case("a memory budget that leaves no room", "refused in one sentence")
 def test_a_full_card_still_starts_and_a_budget_for_nothing_is_refused(card: Any):
     card(0.5, 8)
     cap, line = fit(other=1e9)
-    assert cap == 1 and line.endswith("which holds no more than the 10 at the start: none will be added.")
+    assert cap == 1
+    assert line.endswith("which holds no more than the 10 at the start: none will be added.")
     with pytest.raises(InputError) as error:
         fit(other=1e9, budget_gb=0.5)
     assert str(error.value) == (
@@ -190,7 +202,8 @@ def test_what_is_free_counts_what_this_process_holds_as_its_own(monkeypatch: pyt
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 30)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 10)
     device = torch.device("cuda")
-    assert step_memory.available_bytes(device) == (80, 100) and step_memory.free_bytes(device) == 70
+    assert step_memory.available_bytes(device) == (80, 100)
+    assert step_memory.free_bytes(device) == 70
 
 
 # --- the size of a run ---
@@ -205,14 +218,16 @@ def cameras(width: int = 64, height: int = 48, focal: float = 60.0, number: int 
 
 
 def test_the_size_of_a_run_is_that_of_its_images_and_largest_step():
-    train, held_out = cameras(number=3), cameras(100, 10, number=2)
+    train = cameras(number=3)
+    held_out = cameras(100, 10, number=2)
     datamanager: Any = SimpleNamespace(
         config=SimpleNamespace(cache_images="gpu"),
         train_dataset=SimpleNamespace(cameras=train),
         eval_dataset=SimpleNamespace(cameras=held_out),
     )
     size = training_size(datamanager, views=2)
-    assert size.image_bytes == 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
+    expected = 3 * (3 * 64 * 48 + 2 * 1000) + 3 * 3 * 64 * 48
+    assert size.image_bytes == expected
     assert size.step == StepSize(2, 2 * 64 * 48)
     datamanager.config.cache_images = "cpu"
     size = training_size(datamanager, views=2)
@@ -237,7 +252,9 @@ def test_ns_train_says_the_cap_at_the_start_and_keeps_it(
     config = configure(tmp_path / "scene", tmp_path, iterations=24, save_every=0)
     config.pipeline.model.bounding_box_points = False
     strategy = config.pipeline.model.strategy
-    strategy.max_gaussians, strategy.clone_grad2d, strategy.refine_start_iter = DEFAULT, 0.0, 1
+    strategy.max_gaussians = DEFAULT
+    strategy.clone_grad2d = 0.0
+    strategy.refine_start_iter = 1
     strategy.min_opacity = 0.0
     images = VIEWS * WIDTH * HEIGHT * 3 + 8 * WIDTH * HEIGHT * 3
     unbounded = copy.deepcopy(config)
@@ -274,8 +291,10 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
         config = SimpleNamespace(cache_images="gpu")
         return SimpleNamespace(config=config, train_dataset=dataset(number), eval_dataset=dataset(100))
 
-    gpu, share = torch.device("cuda"), 0.25 if number > 500 else 0.5
-    small, large = datamanager(100), datamanager(10_000)
+    gpu = torch.device("cuda")
+    share = 0.25 if number > 500 else 0.5
+    small = datamanager(100)
+    large = datamanager(10_000)
     size = image_bytes(small)
     assert size == 3 * (number + 100) * 100**2 + 3 * number * 100**2
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1e15)
@@ -284,7 +303,8 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     assert choose_image_storage(small, gpu) == ImageStorage("gpu")
     card(0.99 * size / share / 1e9, 80)
     storage = choose_image_storage(small, gpu)
-    assert storage.where == "cpu" and small.config.cache_images == "gpu", "the caller applies it"
+    assert storage.where == "cpu", "the caller applies it"
+    assert small.config.cache_images == "gpu", "the caller applies it"
     assert storage.sentence.startswith(
         "The images stay in the host's memory and are copied ahead of the steps: decoded images and their structure "
         f"take {size / 1e9:.2g} GB, and the GPU has 0."
@@ -295,7 +315,8 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
         storage = choose_image_storage(large, device)
         compressed = "The images stay compressed and are decoded ahead of the steps: decoded images and "
-        assert storage.where == "compressed" and storage.sentence.startswith(compressed)
+        assert storage.where == "compressed"
+        assert storage.sentence.startswith(compressed)
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in storage.sentence
     monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
     assert choose_image_storage(large, torch.device("cpu")) == ImageStorage("gpu")  # the training device

@@ -89,7 +89,9 @@ def test_one_held_out_view_has_no_deviation_and_none_is_one_sentence(run: tuple[
         raise AssertionError(f"{constant} is no JSON")
 
     results = json.loads((tmp_path / "results.json").read_text(), parse_constant=refuse)["results"]
-    assert {"psnr", "ssim", "fps"} <= results.keys() and not any(name.endswith("_std") for name in results)
+    assert {"psnr", "ssim", "fps"} <= results.keys()
+    for name in results:
+        assert not name.endswith("_std")
 
 
 @pytest.mark.hard_case(
@@ -99,9 +101,11 @@ def test_one_held_out_view_has_no_deviation_and_none_is_one_sentence(run: tuple[
 def test_views_that_nerfstudio_cannot_render_are_one_sentence(run: tuple[int, Path], tmp_path: Path):
     held_out, config = run
     said = said_of(RenderInterpolated(config, tmp_path / "video.mp4"))
-    assert said is not None and said.startswith("A path between views needs two of them, and the run holds out fewer: ")
+    assert said is not None
+    assert said.startswith("A path between views needs two of them, and the run holds out fewer: ")
     said = said_of(SpiralRender(config, tmp_path / "video.mp4"))
-    assert said is not None and said.startswith("`ns-render spiral` does not work with methods that train on whole ")
+    assert said is not None
+    assert said.startswith("`ns-render spiral` does not work with methods that train on whole ")
     if held_out == 0:
         said = said_of(DatasetRender(load_config=config, output_path=tmp_path / "views"))
         assert said == (
@@ -190,7 +194,8 @@ def test_a_camera_path_that_cannot_be_drawn_is_one_sentence(
     text: str | bytes | None, sentence: str, run: tuple[int, Path], tmp_path: Path
 ):
     said = said_of(path_command(run[1], tmp_path, text))
-    assert said is not None and re.match(sentence, said), said
+    assert said is not None, said
+    assert re.match(sentence, said), said
 
 
 @pytest.mark.hard_case("`ns-render` with `rgba`", "PNGs without the background; one sentence for JPEG")
@@ -205,22 +210,22 @@ def test_opacity_and_the_colour_of_a_crop_are_drawn(run: tuple[int, Path], tmp_p
     with Image.open(tmp_path / "views" / "views" / "00000.png") as image:
         rgb = np.asarray(image) / 255
     alpha = rgba[..., 3:]
-    assert rgba.shape == (36, 48, 4) and alpha.min() < 1 < 48 * 36 * alpha.mean()
+    assert rgba.shape == (36, 48, 4)
+    assert alpha.min() < 1 < 48 * 36 * alpha.mean()
     assert np.abs(alpha * rgba[..., :3] - rgb).max() < 0.02  # The model's background is black.
     path_command(run[1], tmp_path, json.dumps(PATH | {"crop": CROP})).main()
     with Image.open(tmp_path / "views" / "00000.png") as image:
-        assert (np.asarray(image) >= [254, 0, 0]).all() and (np.asarray(image)[..., 1:] <= 1).mean() > 0.9
+        assert (np.asarray(image) >= [254, 0, 0]).all()
+        assert (np.asarray(image)[..., 1:] <= 1).mean() > 0.9
     for options in ({"image_format": "jpeg"}, {"rendered_output_names": ["rgb", "rgba"]}):
         said = said_of(
             path_command(run[1], tmp_path, json.dumps(PATH), **{"rendered_output_names": ["rgba"], **options})
         )
-        assert said is not None and said.startswith(
-            "`rgba` fits into PNG alone, and beside no other output: give --ren"
-        )
+        assert said is not None
+        assert said.startswith("`rgba` fits into PNG alone, and beside no other output: give --ren")
     said = said_of(path_command(run[1], tmp_path, json.dumps(PATH), render_nearest_camera=True))
-    assert said is not None and said.startswith(
-        "--render-nearest-camera does not work with methods that train on whole"
-    )
+    assert said is not None
+    assert said.startswith("--render-nearest-camera does not work with methods that train on whole")
 
 
 @pytest.mark.hard_case("`ns-render dataset` of images `a/000.png` and `b/000.png`", "a file for each, in its folder")
@@ -243,7 +248,8 @@ def test_no_rendering_replaces_another(names: tuple[str, str], tmp_path: Path):
     if names[0].startswith("a"):
         command.main()
         written = [path.relative_to(tmp_path / "views/test/rgb") for path in (tmp_path / "views").rglob("*.jpg")]
-        assert len(written) == VIEWS and {Path("a/000.jpg"), Path("b/000.jpg")} <= {*written}
+        assert len(written) == VIEWS
+        assert {Path("a/000.jpg"), Path("b/000.jpg")} <= {*written}
     else:
         with pytest.raises(InputError, match=r"/000\.(jpg|png) and \S+/000\.(jpg|png) differ in their suffix alone"):
             command.main()
@@ -267,7 +273,8 @@ def test_exports_of_fields_name_the_one_of_splats(run: tuple[int, Path], tmp_pat
         exporter.ExportMarchingCubesMesh(run[1], tmp_path),
     ):
         said = said_of(command)
-        assert said is not None and "`sadgs-export RUN --output room.mesh.ply` writes a mesh" in said, command
+        assert said is not None, command
+        assert "`sadgs-export RUN --output room.mesh.ply` writes a mesh" in said, command
     exporter.ExportCameraPoses(run[1], tmp_path).main()
     counts = [len(json.loads((tmp_path / f"transforms_{part}.json").read_text())) for part in ("train", "eval")]
     assert counts == [9, 1]
@@ -323,7 +330,8 @@ def test_a_damaged_checkpoint_is_named(size: int, run: tuple[int, Path]):
     damaged.write_bytes(checkpoint.read_bytes()[:size])
     said = said_of(ComputePSNR(run[1]))
     damaged.unlink()
-    assert said is not None and said.startswith("The latest checkpoint in the run's folder nerfstudio_models cannot be")
+    assert said is not None
+    assert said.startswith("The latest checkpoint in the run's folder nerfstudio_models cannot be")
 
 
 @pytest.mark.hard_case("`--vis wandb` or `--vis comet` without a login", "one sentence")
@@ -361,7 +369,8 @@ def test_a_deleted_working_directory_is_named_before_torch_ends_the_process(tmp_
         env={**os.environ, **path},
     )
     said = "error: The working directory was deleted: change to a folder that exists with `cd`.\n"
-    assert (result.returncode, result.stderr) == (1, said)
+    assert result.returncode == 1
+    assert result.stderr == said
 
 
 @pytest.mark.hard_case("the working directory is deleted while a run saves, and the disk is full there", "one sentence")

@@ -94,7 +94,7 @@ def test_a_row_tells_loss_psnr_gaussians_pace_and_the_time_that_is_left(
     table.write_stats_log(100)  # after the last iteration: nerfstudio's table would lose its header
     lines = [line.split("  ") for line in capsys.readouterr().out.splitlines()]
     cells = [[cell.strip() for cell in line if cell.strip()] for line in lines]
-    assert cells == [
+    expected = [
         ["Viewer at: there"],
         ["Step (% Done)", "Loss", "PSNR", "Gaussians", "Iteration", "Time left"],
         ["-" * 70],
@@ -102,6 +102,7 @@ def test_a_row_tells_loss_psnr_gaussians_pace_and_the_time_that_is_left(
         ["10 (10.00%)", "0.5000", "30.00 dB", "10,000", "400 ms"],
         ["50 (50.00%)", "0.5000", "70.00 dB", "50,000", "2.0 s", "59 s"],
     ]
+    assert cells == expected
 
 
 def test_where_minutes_are_left_their_bounds_are_told_from_the_second_row_on(
@@ -112,7 +113,8 @@ def test_where_minutes_are_left_their_bounds_are_told_from_the_second_row_on(
         clock[0] += seconds
         log(table, events, step)
     rows = capsys.readouterr().out.splitlines()[2:]
-    assert [row.split("  ")[-1].strip() for row in rows] == ["0 (0.00%)", "3–12 min"]
+    actual = [row.split("  ")[-1].strip() for row in rows]
+    assert actual == ["0 (0.00%)", "3–12 min"]
 
 
 def test_bounds_of_the_time_left_have_one_unit():
@@ -129,7 +131,8 @@ def test_after_densification_the_time_left_goes_by_the_latest_rows(
     for step, seconds in ((60, 0.0), (70, 10.0), (80, 10.0)):
         clock[0] += seconds
         log(table, events, step)
-    assert capsys.readouterr().out.splitlines()[-1].split()[-4:] == ["1.0", "s", "19", "s"]
+    actual = capsys.readouterr().out.splitlines()[-1].split()[-4:]
+    assert actual == ["1.0", "s", "19", "s"]
 
 
 @pytest.mark.hard_case(
@@ -190,15 +193,18 @@ def test_the_time_left_is_within_30_percent_on_all_captures_whose_times_were_kep
     for row in rows:
         if row["method"] != "sadgs" or not row.get("curve"):
             continue
-        total, end = row["iterations"], row["curve"][-1]["seconds"]
+        total = row["iterations"]
+        end = row["curve"][-1]["seconds"]
         for before, point in itertools.pairwise([{"step": 0, "seconds": 0.0}, *row["curve"][:-1]]):
             pace = (point["seconds"] - before["seconds"]) / (point["step"] - before["step"])
             left = time_left(-1, point["step"] - 1, total, point["seconds"], before["step"], pace)
             if left is not None:
                 off = 0.21 if before["step"] > 0.533 * total else 0.3
-                assert left == pytest.approx(end - point["seconds"], rel=off), (row["key"], point)
+                expected = pytest.approx(end - point["seconds"], rel=off)
+                assert left == expected, (row["key"], point)
                 told[row["scene"]] = told.get(row["scene"], 0) + 1
-    assert len(told) == 8 and min(told.values()) >= 2
+    assert len(told) == 8
+    assert min(told.values()) >= 2
     assert time_left(-1, 99, 1000, 5.0) is None, "too early to tell"
     assert time_left(499, 699, 1000, 5.0) is None, "too early after resuming"
 
@@ -235,13 +241,15 @@ def test_in_a_terminal_rows_stay_in_place_and_warnings_above_them(
     table.write_stats_log(100)
     text = shown.getvalue()
     remove_tables()
-    assert writer.EVENT_WRITERS == [] and shown.getvalue() == text
+    assert writer.EVENT_WRITERS == []
+    assert shown.getvalue() == text
     assert text.endswith("\x1b[?25h"), "the cursor is shown again"
     # What is printed takes the place of the table, which is drawn anew below it.
     after = text.partition("Iteration 41: the loss was nan\n")[2]
     assert after.index("of nerfstudio\n") < after.index("50 (50.00%)")
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text[text.rindex("Step (% Done)") :]).split()
-    assert "30" not in last and {"40", "50", "Viewer"} <= set(last), "two rows and the banner"
+    assert "30" not in last, "two rows and the banner"
+    assert {"40", "50", "Viewer"} <= set(last), "two rows and the banner"
 
 
 @pytest.mark.hard_case("output to a file", "one line for each row")
@@ -253,35 +261,42 @@ def test_a_run_says_its_progress_and_what_can_be_done_with_it(
     config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     config.output_dir = tmp_path / "my runs"
-    config.logging.local_writer.enable, config.logging.steps_per_log = True, 4
+    config.logging.local_writer.enable = True
+    config.logging.steps_per_log = 4
     config.save_config()
     trainer = set_up(config)
     before = trainer.pipeline.model.num_points
     trainer.train()
     printed = capsys.readouterr().out
     rows = re.findall(r"^(\d+) \(.+%\) +\d\.\d{4} +\d+\.\d\d dB +([\d,]+)( .*)?$", printed, re.MULTILINE)
-    assert [int(row[0]) for row in rows] == list(range(0, ITERATIONS, 4))
+    actual = [int(row[0]) for row in rows]
+    expected = list(range(0, ITERATIONS, 4))
+    assert actual == expected
     numbers = [int(row[1].replace(",", "")) for row in rows]
     assert numbers[0] == before
-    assert not any(isinstance(w, ProgressTable) for w in writer.EVENT_WRITERS), (
-        "a later run in this process has a table of its own"
-    )
-    assert "Train Rays" not in printed and "profiling" not in printed
+    for w in writer.EVENT_WRITERS:
+        assert not isinstance(w, ProgressTable), "a later run in this process has a table of its own"
+    assert "Train Rays" not in printed
+    assert "profiling" not in printed
 
     gaussians = trainer.pipeline.model.num_points
     box, _, end = printed.partition(f"What can be done with these {gaussians:,} Gaussians:\n")
     assert "Training Finished" in box
     viewer, evaluate, to_ply = [shlex.split(line) for line in end.splitlines()[::2]]
     run = config.get_base_dir()
-    assert viewer[0] == "ns-viewer" and tyro.cli(RunViewer, args=viewer[1:]).load_config == run / "config.yml"
-    assert evaluate[0] == "ns-eval" and tyro.cli(ComputePSNR, args=evaluate[1:]).load_config == run / "config.yml"
-    assert to_ply[0] == "sadgs-export" and export.main(to_ply[1:]) == 0
+    assert viewer[0] == "ns-viewer"
+    assert tyro.cli(RunViewer, args=viewer[1:]).load_config == run / "config.yml"
+    assert evaluate[0] == "ns-eval"
+    assert tyro.cli(ComputePSNR, args=evaluate[1:]).load_config == run / "config.yml"
+    assert to_ply[0] == "sadgs-export"
+    assert export.main(to_ply[1:]) == 0
     assert (run / "splat.ply").is_file()
 
 
 def test_the_table_is_there_by_default():
     logging = SadgsTrainerConfig(method_name="sadgs").logging
-    assert logging.local_writer.enable and isinstance(logging.local_writer.setup(), ProgressTable)
+    assert logging.local_writer.enable
+    assert isinstance(logging.local_writer.setup(), ProgressTable)
 
 
 @pytest.mark.hard_case(
@@ -294,4 +309,5 @@ def test_a_run_on_the_cpu_says_that_it_is_slow_and_what_to_do_beside_other_work(
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     set_up(config)
     assert f"{cpu_notice(2)}\n" in capsys.readouterr().out
-    assert "put OMP_NUM_THREADS=1 before the command" in cpu_notice(2) and "OMP_NUM_THREADS" not in cpu_notice(1)
+    assert "put OMP_NUM_THREADS=1 before the command" in cpu_notice(2)
+    assert "OMP_NUM_THREADS" not in cpu_notice(1)

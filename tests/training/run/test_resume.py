@@ -147,18 +147,21 @@ class Clock:
 def test_the_clock_makes_checkpoints_that_change_nothing_and_resume_to_the_same_model(
     scene: Path, finished: Path, config: SadgsTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    assert (config.steps_per_save, config.seconds_per_save) == (0, 60)
+    assert config.steps_per_save == 0
+    assert config.seconds_per_save == 60
     config.save_only_latest_checkpoint = False
     trainer = set_up(config)
     with monkeypatch.context() as patched:
-        (clock := Clock()).attach(trainer, patched)
+        clock = Clock()
+        clock.attach(trainer, patched)
         trainer.train()
     # Due after 60 s, and then after 200 s, since a checkpoint takes 2 s.
     assert clock.saved == [2, 10, ITERATIONS - 1]
     assert checkpoints(trainer) == [f"step-{step:09d}.ckpt" for step in clock.saved]
 
     resumed_config = configure(scene, tmp_path / "resumed", ITERATIONS, save_every=0)
-    resumed_config.load_dir, resumed_config.load_step = trainer.checkpoint_dir, 2
+    resumed_config.load_dir = trainer.checkpoint_dir
+    resumed_config.load_step = 2
     resumed = set_up(resumed_config)
     resumed.train()
     (last,) = (finished / "nerfstudio_models").iterdir()
@@ -188,7 +191,8 @@ def test_the_clock_gives_way_to_steps_and_makes_nothing_in_a_short_run(
     for name, value in settings.items():
         setattr(config, name, value)
     trainer = set_up(config)
-    (clock := Clock()).attach(trainer, monkeypatch, seconds)
+    clock = Clock()
+    clock.attach(trainer, monkeypatch, seconds)
     trainer.train()
     assert clock.saved == saved
 
@@ -308,7 +312,8 @@ def test_a_second_hang_up_does_not_stop_the_saving(config: SadgsTrainerConfig, m
 def test_a_hang_up_that_follows_a_failed_write_does_not_stop_the_saving(
     config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch
 ):
-    trainer, save = set_up(config), torch.save
+    trainer = set_up(config)
+    save = torch.save
     update = trainer._update_viewer_state
 
     def lost(step: int) -> None:
@@ -371,7 +376,8 @@ def test_a_terminal_that_is_gone_costs_nothing_that_was_trained(scene: Path, tmp
 def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: Path, tmp_path: Path):
     """As where the system sends SIGHUP before it takes the terminal away."""
     ours, theirs = os.openpty()
-    saving, gone = tmp_path / "saving", tmp_path / "gone"
+    saving = tmp_path / "saving"
+    gone = tmp_path / "gone"
     script = "import time, torch; save = torch.save\n"
     script += f"from pathlib import Path; saving, gone = Path({str(saving)!r}), Path({str(gone)!r})\n"
     script += "def wait_and_save(*arguments):\n"
@@ -406,7 +412,8 @@ def test_a_terminal_that_goes_while_the_hung_up_run_saves_hides_nothing(scene: P
 @pytest.mark.parametrize("errors", ["elsewhere", "to the same reader", "closed"])
 def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: Path, tmp_path: Path):
     """As with `| head`, or with `| tee log` where tee is killed."""
-    output, iterations = tmp_path / "output", 40
+    output = tmp_path / "output"
+    iterations = 40
     files = output, output if errors == "to the same reader" else tmp_path / "errors"
     os.mkfifo(output)
     script = "import os, sys; os.close(2); sys.stderr = None\n" if errors == "closed" else ""
@@ -423,7 +430,9 @@ def test_a_run_whose_output_nobody_reads_any_more_trains_on(errors: str, scene: 
     if errors == "elsewhere":
         printed = files[1].read_text()
         rows = re.findall(r"^(\d+) \(\d", printed, re.MULTILINE)
-        assert rows and rows == [str(step) for step in range(40 - 10 * len(rows), 40, 10)]
+        assert rows
+        expected = [str(step) for step in range(40 - 10 * len(rows), 40, 10)]
+        assert rows == expected
         assert printed.count("What can be done with these") == 1
 
 
@@ -499,7 +508,8 @@ def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_er
 ):
     trainer = set_up(config)
     owner, name = (torch, "save") if moment == "final save" else (Trainer, "_train_complete_viewer")
-    original, calls = getattr(owner, name), []
+    original = getattr(owner, name)
+    calls = []
 
     def interrupted(*arguments: Any) -> Any:
         calls.append(arguments)
@@ -509,7 +519,8 @@ def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_er
 
     monkeypatch.setattr(owner, name, interrupted)
     trainer.train()
-    assert calls and checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
+    assert calls
+    assert checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
     assert "SIGINT" not in capsys.readouterr().out
 
 
@@ -565,7 +576,8 @@ def test_opening_a_finished_run_says_how_to_train_on_and_ends_well(
 ):
     (saved,) = (finished / "nerfstudio_models").iterdir()
     setattr(config, option, finished if option == "load_dir" else saved)
-    config.vis, config.viewer.quit_on_train_completion = vis, True  # type: ignore[assignment]
+    config.vis = vis  # type: ignore[assignment]
+    config.viewer.quit_on_train_completion = True
     config.logging.local_writer.enable = True
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -604,7 +616,8 @@ def test_a_run_s_folder_does_as_well_as_its_folder_of_checkpoints(finished: Path
 def test_checkpoints_of_an_earlier_run_are_not_deleted(finished: Path, config: SadgsTrainerConfig, tmp_path: Path):
     """As where --timestamp names a finished run, or --load-config a run that was killed and so names no checkpoint."""
     (saved,) = (finished / "nerfstudio_models").iterdir()
-    config.output_dir, elsewhere = finished.parents[2], tmp_path / "elsewhere"
+    config.output_dir = finished.parents[2]
+    elsewhere = tmp_path / "elsewhere"
     assert config.get_base_dir() == finished
     elsewhere.mkdir()
     shutil.copy(saved, elsewhere)
@@ -675,7 +688,8 @@ def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked
     trainer = set_up(config)
     trainer.save_checkpoint(0)
     derived = length_of(trainer)
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")  # It has more views.
     assert length_of(set_up(config)) == derived
@@ -683,7 +697,9 @@ def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked
     config.pipeline.effort = 2.0
     views = len(set_up(config).pipeline.datamanager.train_dataset)
     assert length_of(set_up(config)) == schedule(views, effort=2.0) != derived
-    config.pipeline.effort, config.max_num_iterations, config.pipeline.views_per_iteration = 1.0, 7, 3
+    config.pipeline.effort = 1.0
+    config.max_num_iterations = 7
+    config.pipeline.views_per_iteration = 3
     assert length_of(set_up(config)) == Schedule(iterations=7, views_per_iteration=3)
 
 
@@ -697,7 +713,8 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
     config.pipeline.model.color_model = "affine"
     trainer = set_up(config)
     trainer.save_checkpoint(1)
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
     assert set_up(config)._start_step == 2
     config.pipeline.model.color_model = "none"
     with pytest.raises(InputError, match=r"It optimized color_matrices, too: set pipeline\.model\.color-model "):
@@ -775,14 +792,16 @@ def test_a_resumption_keeps_the_cap_where_memory_has_room_for_it(
     trainer.save_checkpoint(1)
     assert trainer.pipeline.model.plan.strategy.max_gaussians == 500
     plan(now)
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
     config.pipeline.model.strategy.max_gaussians = asked
     capsys.readouterr()
     resumed = set_up(config)
     printed = capsys.readouterr().out
     assert resumed.pipeline.model.plan.strategy.max_gaussians == cap
     assert resumed.pipeline.structure.set_max_gaussians.value == cap
-    assert said in printed and (said or "checkpoint's run" not in printed)
+    assert said in printed
+    assert said or "checkpoint's run" not in printed
 
 
 # --- damaged checkpoints ---
@@ -844,8 +863,10 @@ def test_damaged_checkpoints_alone_are_one_sentence(
     with pytest.raises(ValueError) as error:
         set_up(config)
     message = str(error.value)
-    assert message.startswith(str(folder / "step-000000002.ckpt")) and message.endswith("or train from scratch.")
-    assert "\n" not in message and "Going on" not in capsys.readouterr().out
+    assert message.startswith(str(folder / "step-000000002.ckpt"))
+    assert message.endswith("or train from scratch.")
+    assert "\n" not in message
+    assert "Going on" not in capsys.readouterr().out
 
 
 @pytest.mark.hard_case(
@@ -861,7 +882,8 @@ def test_a_damaged_checkpoint_that_was_asked_for_is_not_replaced_by_another(
     if which == "load_step":
         config.load_step = 2
     else:
-        config.load_dir, config.load_checkpoint = None, folder / "step-000000002.ckpt"
+        config.load_dir = None
+        config.load_checkpoint = folder / "step-000000002.ckpt"
     with pytest.raises(ValueError, match=r"step-000000002\.ckpt is cut off, damaged or"):
         set_up(config)
 
@@ -873,6 +895,7 @@ def test_a_folder_without_checkpoints_and_a_missing_step_are_one_sentence_each(
     config.load_step = 3
     with pytest.raises(ValueError, match=r"holds no checkpoint of step 3: give --load-step one of 1, 2\."):
         set_up(config)
-    config.load_dir, config.load_step = tmp_path / "none", None
+    config.load_dir = tmp_path / "none"
+    config.load_step = None
     with pytest.raises(ValueError, match=r"none holds no checkpoint: give --load-dir the folder"):
         set_up(config)

@@ -25,7 +25,8 @@ def test_the_methods_import_nothing_that_training_does_not_need():
     start += "; from sadgs_ns.geometry.initialization import neighbour_scales; neighbour_scales(torch.rand(9, 3))"
     code = f"{start}; print([name for name in {LATER} if name in sys.modules])"
     run = forked_python.python(code)
-    assert (run.returncode, run.stdout.strip()) == (0, "[]"), run.stderr
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "[]", run.stderr
 
 
 @pytest.fixture
@@ -51,18 +52,22 @@ def test_a_run_says_in_two_lines_what_it_chose(
     assert "At most 2,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.\n" in printed
 
     trainer.save_checkpoint(4)
-    config.load_dir, config.output_dir = trainer.checkpoint_dir, tmp_path / "resumed"
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
     assert f": {ITERATIONS} iterations of 4 views, of which 5 are done, so that each" in says(config)[1]
 
 
 def test_the_number_of_views_and_the_effort_decide_what_is_not_set_by_hand(
     config: SadgsTrainerConfig, says: Callable[[SadgsTrainerConfig], tuple[SadgsTrainer, str]]
 ):
-    config.max_num_iterations, config.pipeline.effort = None, 0.5
+    config.max_num_iterations = None
+    config.pipeline.effort = 0.5
     trainer, printed = says(config)
-    pipeline, plan = trainer.pipeline, trainer.pipeline.model.plan
+    pipeline = trainer.pipeline
+    plan = trainer.pipeline.model.plan
     visits = 0.5 * (2000 + 50 * len(pipeline.datamanager.train_dataset))
-    assert (plan.iterations, plan.views_per_iteration) == (math.ceil(visits), 1)
+    assert plan.iterations == math.ceil(visits)
+    assert plan.views_per_iteration == 1
     assert trainer.config.max_num_iterations == plan.iterations
     assert pipeline.model.strategy == config.pipeline.model.strategy.for_run(plan.iterations)
     assert f": {plan.iterations:,} iterations of 1 view, so that each view is rendered about" in printed
@@ -87,8 +92,10 @@ def test_rates_follow_the_views_of_a_step(config: SadgsTrainerConfig):
     assert rates(1)[0].keys() == {"means", *constant}
     first, last = rates(4)
     extent = set_up(config).pipeline.model.strategy_state["scene_scale"]
-    assert first == pytest.approx({"means": 4.8e-4 * extent, "scales": 0.045, "quats": 0.0045} | constant)
-    assert last == pytest.approx({"means": 4.8e-6 * extent, "scales": 0.0075, "quats": 0.00075} | constant)
+    expected = pytest.approx({"means": 4.8e-4 * extent, "scales": 0.045, "quats": 0.0045} | constant)
+    assert first == expected
+    expected = pytest.approx({"means": 4.8e-6 * extent, "scales": 0.0075, "quats": 0.00075} | constant)
+    assert last == expected
     config.rates_follow_views = False
     assert rates(4) == rates(1)
 

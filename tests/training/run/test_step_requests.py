@@ -22,7 +22,8 @@ def test_the_numbers_of_several_processes_hold_what_any_of_them_asks_for():
     flags = 0
     for requests in (*asked, StepRequests(signals=(signal.SIGINT,))):
         flags |= requests.encode()
-    assert StepRequests.decode(flags) == StepRequests(save=True, signals=(signal.SIGINT, signal.SIGHUP))
+    expected = StepRequests(save=True, signals=(signal.SIGINT, signal.SIGHUP))
+    assert StepRequests.decode(flags) == expected
 
 
 def test_a_process_that_asks_for_nothing_sends_zero():

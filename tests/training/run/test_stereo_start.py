@@ -34,24 +34,35 @@ def config(colmap: ColmapDataParserConfig, tmp_path: Path) -> Any:
 
 
 def test_points_near_the_surfaces_are_added_to_the_initial_ones_whatever_the_seed(config: Any):
-    started, config.machine.seed = set_up(config).pipeline, 7
-    model, again = started.model, set_up(config).pipeline.model
-    assert torch.equal(model.means, again.means) and not torch.equal(model.quats, again.quats)
+    started = set_up(config).pipeline
+    config.machine.seed = 7
+    model = started.model
+    again = set_up(config).pipeline.model
+    assert torch.equal(model.means, again.means)
+    assert not torch.equal(model.quats, again.quats)
     config.pipeline.model.stereo_points = 0
     before = set_up(config).pipeline.model.means
-    assert len(before) + 100 < model.num_points <= len(before) + 400 and (model.means[: len(before)] == before).all()
+    assert len(before) + 100 < model.num_points <= len(before) + 400
+    assert (model.means[: len(before)] == before).all()
     added = {name: value.detach()[len(before) :].cpu().double() for name, value in model.gauss_params.items()}
     assert (added["opacities"].sigmoid() - model.config.initial_opacity).abs().max() < 1e-5
     ways = (added["means"][:, None] - model.means.detach().cpu().double()).norm(dim=2)
     shares = added["scales"].exp() / ways.topk(4, largest=False).values[:, 1:].mean(dim=1, keepdim=True)
-    assert 0.01 < shares.min() < 0.5 and shares.max() < 1 + 1e-4, "only short wavelengths make points smaller"
-    data, rng = started.datamanager.train_dataparser_outputs, np.random.default_rng(0)
-    samples = [(points := surface.sample(5000, rng), surface.colour(points)) for surface in room_surfaces()]
+    assert 0.01 < shares.min() < 0.5, "only short wavelengths make points smaller"
+    assert shares.max() < 1 + 1e-4, "only short wavelengths make points smaller"
+    data = started.datamanager.train_dataparser_outputs
+    rng = np.random.default_rng(0)
+    samples = []
+    for surface in room_surfaces():
+        points = surface.sample(5000, rng)
+        samples.append((points, surface.colour(points)))
     positions, colors = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     drawn = points_in_the_run(positions, colors, data.dataparser_transform, data.dataparser_scale)
     distances, nearest = torch.cdist(added["means"], drawn["points3D_xyz"].double()).min(dim=1)
     colors = SH2RGB(added["features_dc"])
-    assert distances.median() < 0.05 and colors.min() > -1e-5 and colors.max() < 1 + 1e-5
+    assert distances.median() < 0.05
+    assert colors.min() > -1e-5
+    assert colors.max() < 1 + 1e-5
     assert (colors - drawn["points3D_rgb"][nearest]).abs().mean() < 0.12
 
 
@@ -64,7 +75,9 @@ def test_few_points_are_joined_by_stereo_depth_or_a_line_says_why_not(config: An
         with monkeypatch.context() as patched:
             patched.setattr(pipeline.SadgsPipeline, "device", torch.device("cuda"))
             number = stereo_start.number_of_points(started)
-        assert (said, number) == (says_so, stereo_start.NUMBER * says_so) and started.model.num_points <= POINTS
+        assert said == says_so
+        assert number == stereo_start.NUMBER * says_so
+        assert started.model.num_points <= POINTS
 
     config.machine.device_type, model = "cpu", config.pipeline.model
     for model.stereo_points, model.random_init in ((0, False), (400, True), (None, True), (None, False)):
@@ -107,7 +120,8 @@ def test_images_that_stay_compressed_are_decoded_one_by_one(config: Any, monkeyp
     config.pipeline.datamanager.cache_images = "compressed"
     monkeypatch.setattr(LazyImages, "__getitem__", counted)
     set_up(config)
-    assert len(alive) >= TRAIN_VIEWS and max(alive) < TRAIN_VIEWS / 2
+    assert len(alive) >= TRAIN_VIEWS
+    assert max(alive) < TRAIN_VIEWS / 2
 
 
 @pytest.mark.parametrize("cap", [POINTS - 100, POINTS, POINTS + 50])
@@ -130,23 +144,28 @@ def test_points_lie_where_two_views_are_not_masked(config: Any, scene: Path, tmp
     for image in (scene / "images").iterdir():
         Image.fromarray(right_half).save(tmp_path / image.name)
     data = config.pipeline.datamanager
-    data.dataparser.masks_path, data.cache_images = tmp_path, "compressed"
+    data.dataparser.masks_path = tmp_path
+    data.cache_images = "compressed"
     masked = set_up(config).pipeline
     cameras = masked.datamanager.train_dataset.cameras
     viewmats = viewmats_from_camera_to_world(cameras.camera_to_worlds)
     points = masked.model.means.detach()[POINTS:].cpu() @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
     x = (points @ cameras.get_intrinsics_matrices().mT)[..., 0] / points[..., 2]  # px [V, P]
-    assert x.shape[1] > 50 and ((x > WIDTH // 2 - 1e-3) & (x < WIDTH)).sum(dim=0).min() >= 2
+    assert x.shape[1] > 50
+    assert ((x > WIDTH // 2 - 1e-3) & (x < WIDTH)).sum(dim=0).min() >= 2
 
 
 def test_the_paper_s_presets_start_as_the_paper_says():
     models: list[Any] = [p.config.pipeline.model for p in (presets.sadgs_paper, presets.sadgs_paper_indoor)]
-    assert [(m.stereo_points, m.clear_paths, m.near_plane) for m in models] == [(0, False, "scene")] * 2
+    actual = [(m.stereo_points, m.clear_paths, m.near_plane) for m in models]
+    expected = [(0, False, "scene")] * 2
+    assert actual == expected
 
 
 @pytest.mark.parametrize("asked", [True, False])
 def test_the_cameras_paths_are_kept_clear_if_the_options_ask_for_it(asked: bool, config: Any):
-    config.pipeline.model.stereo_points, config.pipeline.model.clear_paths = 0, asked
+    config.pipeline.model.stereo_points = 0
+    config.pipeline.model.clear_paths = asked
     assert ("camera_paths" in set_up(config).pipeline.model.strategy_state) == asked
 
 
@@ -155,7 +174,8 @@ def test_the_cameras_paths_are_kept_clear_if_the_options_ask_for_it(asked: bool,
     "these still tell surfaces from haze",
 )
 def test_sfm_points_are_of_surfaces_if_no_gaussian_starts_from_them(config: Any, monkeypatch: pytest.MonkeyPatch):
-    config.pipeline.model.stereo_points, points = 0, []
+    config.pipeline.model.stereo_points = 0
+    points = []
     for clearance, config.pipeline.model.random_init in ((0.0, False), (20.0, False), (0.0, True)):
         monkeypatch.setattr("sadgs_ns.training.model.CAMERA_CLEARANCE", clearance)
         model = set_up(config).pipeline.model
@@ -172,7 +192,8 @@ def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
     started.set_extra_state(torch.load(tmp_path / "state", weights_only=True))
     assert len(paths.points) > 0
     for name, value in vars(paths).items():
-        torch.testing.assert_close(getattr(started.strategy_state["camera_paths"], name), value, rtol=0, atol=0)
+        actual = getattr(started.strategy_state["camera_paths"], name)
+        torch.testing.assert_close(actual, value, rtol=0, atol=0)
 
 
 def test_a_negative_number_of_points_is_refused(config: Any):

@@ -83,14 +83,20 @@ def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.M
     matrices.requires_grad_()
     corrected = correct_colors(torch.zeros_like(render), torch.zeros_like(alpha), matrices)
     corrected.backward(upstream)
-    assert not corrected.any() and matrices.grad is not None and not matrices.grad.any()
+    assert not corrected.any()
+    assert matrices.grad is not None
+    assert not matrices.grad.any()
 
 
 def test_the_mean_of_all_views_matrices_is_the_identity():
     matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=torch.Generator().manual_seed(0))).requires_grad_()
     every = anchored(matrices, torch.arange(7))
-    torch.testing.assert_close(every.mean(dim=0), torch.eye(3, 4), atol=1e-6, rtol=0)
-    torch.testing.assert_close(every - every[:1], (matrices - matrices[:1]).detach() + 0 * every, atol=1e-6, rtol=0)
+    actual = every.mean(dim=0)
+    expected = torch.eye(3, 4)
+    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    actual = every - every[:1]
+    expected = (matrices - matrices[:1]).detach() + 0 * every
+    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
     chosen = anchored(matrices, torch.tensor([5, 2]))
     assert torch.equal(chosen, every[[5, 2]])
     chosen.sum().backward()
@@ -107,9 +113,11 @@ def test_nothing_changes_at_the_start():
 def test_a_gain_in_linear_light_is_an_affine_map_of_srgb_but_for_the_darkest():
     light = torch.linspace(0.0031308, 0.25, 100)  # Twice and four times as much of it is neither dark nor saturated.
     for gain in (2.0, 4.0):
-        bright, dark = (1.055 * value ** (1 / 2.4) - 0.055 for value in (gain * light, light))
+        bright = 1.055 * (gain * light) ** (1 / 2.4) - 0.055
+        dark = 1.055 * light ** (1 / 2.4) - 0.055
         factor = gain ** (1 / 2.4)
-        torch.testing.assert_close(bright, factor * dark + 0.055 * (factor - 1), atol=1e-6, rtol=0)
+        expected = factor * dark + 0.055 * (factor - 1)
+        torch.testing.assert_close(bright, expected, atol=1e-6, rtol=0)
 
 
 def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure():
@@ -131,4 +139,5 @@ def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure()
         optimizer.step()
     torch.testing.assert_close(scene.detach(), truth, atol=0.02, rtol=0)
     learned = correct_colors(truth.expand(5, -1, -1, -1), alpha, anchored(matrices, torch.arange(5)).detach())
-    torch.testing.assert_close(learned, gains[:, None, None, None] * truth, atol=0.03, rtol=0)
+    expected = gains[:, None, None, None] * truth
+    torch.testing.assert_close(learned, expected, atol=0.03, rtol=0)

@@ -97,9 +97,11 @@ def assert_same_images(images: Any, expected: Any, difference: int = 0) -> None:
     """Check that data agree to the bit, but images may have a difference in levels."""
     assert len(images) == len(expected)
     for data, other in zip(images, expected, strict=True):
-        assert data.keys() == other.keys() and data["image_idx"] == other["image_idx"]
+        assert data.keys() == other.keys()
+        assert data["image_idx"] == other["image_idx"]
         for name in data.keys() - {"image_idx"}:
-            assert data[name].dtype == other[name].dtype and data[name].shape == other[name].shape
+            assert data[name].dtype == other[name].dtype
+            assert data[name].shape == other[name].shape
             if name == "image":
                 assert (data[name].int() - other[name].int()).abs().max() <= difference
             else:
@@ -109,7 +111,8 @@ def assert_same_images(images: Any, expected: Any, difference: int = 0) -> None:
 
 def assert_same_cameras(cameras: Any, expected: Any) -> None:
     for field in dataclasses.fields(cameras):
-        value, other = getattr(cameras, field.name), getattr(expected, field.name)
+        value = getattr(cameras, field.name)
+        other = getattr(expected, field.name)
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, other)
         else:  # Ours also know which training views they are.
@@ -141,8 +144,10 @@ def test_the_darker_half_of_a_mask_s_values_is_hidden(
         else:
             Image.fromarray(values.astype(np.uint16 if mode == "I;16" else np.uint8)).save(path)
     found = [data["mask"] for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train]
-    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
-    assert all(0 < mask.float().mean() < 1 for mask in expected)
+    for pair in zip(found, expected, strict=True):
+        assert torch.equal(*pair)
+    for mask in expected:
+        assert 0 < mask.float().mean() < 1
 
 
 def test_hidden_pixels_get_the_parser_s_colour(tmp_path: Path):
@@ -150,7 +155,8 @@ def test_hidden_pixels_get_the_parser_s_colour(tmp_path: Path):
     parser.mask_color = (1.0, 0.0, 0.0)
     for data in datamanager_of(parser, cache_images=COMPRESSED).cached_train:
         hidden = data["image"][~data["mask"][..., 0]]
-        assert (hidden == torch.tensor([1, 0, 0])).all() and len(hidden) > 0
+        assert (hidden == torch.tensor([1, 0, 0])).all()
+        assert len(hidden) > 0
         assert data["image"][data["mask"][..., 0]].float().std() > 1
 
 
@@ -187,7 +193,8 @@ def test_images_and_cameras_are_nerfstudio_s_to_the_bit(
         assert_same_cameras(datamanager.eval_dataset.cameras, expected.eval_dataset.cameras)
     assert_same_cameras(datamanager.train_cameras, expected.train_cameras)
     assert datamanager.get_train_rays_per_batch() == expected.get_train_rays_per_batch()
-    views, expected_views = datamanager.fixed_indices_eval_dataloader, expected.fixed_indices_eval_dataloader
+    views = datamanager.fixed_indices_eval_dataloader
+    expected_views = expected.fixed_indices_eval_dataloader
     assert_same_images([view for _, view in views], [view for _, view in expected_views], difference)
     for (camera, _), (other, _) in zip(views, expected_views, strict=True):
         assert_same_cameras(camera, other)
@@ -203,7 +210,8 @@ def test_jpegs_are_decoded_by_opencv_only_if_it_agrees_with_pillow(
     expected = datamanager_of(parser, FullImageDatamanagerConfig, cache_images="gpu", cache_images_type="uint8")
     assert len(expected.cached_train) == VIEWS - 1
     by_pillow: list[int] = []
-    decode, read = cv2.imdecode, InputDataset.get_numpy_image
+    decode = cv2.imdecode
+    read = InputDataset.get_numpy_image
     monkeypatch.setattr(cv2, "imdecode", lambda *args: decode(*args) + (0 if agrees else 1))
     monkeypatch.setattr(
         InputDataset, "get_numpy_image", lambda dataset, index: by_pillow.append(index) or read(dataset, index)
@@ -253,7 +261,9 @@ def run(parser: DataParserConfig, tier: Any, folder: Path, **options: Any) -> tu
 
 @pytest.mark.parametrize("data", ["masks and sizes", "alpha"])
 def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tmp_path: Path):
-    states, sums, seen = [], [], []
+    states = []
+    sums = []
+    seen = []
     for tier in TIERS:
         trainer, steps = run(DATA[data](tmp_path / f"data {tier}"), tier, tmp_path / tier)
         assert isinstance(trainer.pipeline.datamanager.cached_train, list) is (tier != "compressed")
@@ -264,7 +274,8 @@ def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tm
         observed = observe_training_views(trainer.pipeline.structure_cache)
         seen.append([view.photo, view.structure_tensor.nan_to_num(-1), view.camera[1], *observed.values()])
     for tensors in zip(*seen, strict=True):
-        assert all(torch.equal(tensor, tensors[0]) for tensor in tensors)
+        for tensor in tensors:
+            assert torch.equal(tensor, tensors[0])
     assert sums[0] == sums[1] == sums[2]
     expected = states[0]
     for state in states[1:]:
@@ -289,7 +300,8 @@ def image_threads() -> list[threading.Thread]:
 def test_threads_decode_ahead_and_end_with_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     seen: list[int] = []
     late: list[int] = []
-    take, copy = ImagePrefetcher.take, ImagePrefetcher._copy
+    take = ImagePrefetcher.take
+    copy = ImagePrefetcher._copy
 
     def noted_take(prefetcher: ImagePrefetcher, indices: list[int]) -> Any:
         late.extend(index for index in indices if index not in prefetcher._loading | prefetcher._sent)
@@ -303,14 +315,16 @@ def test_threads_decode_ahead_and_end_with_the_run(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(ImagePrefetcher, "take", noted_take)
     monkeypatch.setattr(ImagePrefetcher, "_copy", noted_copy)
     run(nerfstudio_data(tmp_path / "data"), "compressed", tmp_path)
-    assert len(late) == 3 and min(seen) >= 1, "The first step's images alone are late."
+    assert len(late) == 3, "The first step's images alone are late."
+    assert min(seen) >= 1, "The first step's images alone are late."
     assert image_threads() == []
 
 
 def test_an_image_that_breaks_during_the_run_ends_it_in_one_sentence(tmp_path: Path):
     parser = nerfstudio_data(tmp_path / "data")
     config = configure(tmp_path, parser, ITERATIONS)
-    config.pipeline.datamanager.cache_images, config.steps_per_save = COMPRESSED, 2
+    config.pipeline.datamanager.cache_images = COMPRESSED
+    config.steps_per_save = 2
 
     def remove(trainer: SadgsTrainer) -> None:
         if trainer.step == 5:
@@ -380,7 +394,8 @@ def test_images_in_bytes_are_not_searched_for_nan_because_the_host_would_wait(
 
     monkeypatch.setattr(structure_cache, "multiscale_structure_tensor", noted)
     run(nerfstudio_data(tmp_path / "data", masks=True), COMPRESSED, tmp_path)
-    assert known and all(known)
+    assert known
+    assert all(known)
 
 
 # --- CUDA's streams, without CUDA ---
@@ -390,7 +405,8 @@ class Stream:
     """A stream of CUDA's, as far as the order of its work goes."""
 
     def __init__(self, name: str, log: list[str]) -> None:
-        self.name, self.log = name, log
+        self.name = name
+        self.log = log
 
     def wait_event(self, event: Event) -> None:
         self.log.append(f"{self.name} waits for {event.name}")
@@ -414,7 +430,9 @@ class Pixels(torch.Tensor):
     @classmethod
     def of(cls, name: str, log: list[str], pinned: bool) -> Pixels:
         pixels = torch.zeros((2, 2, 3), dtype=torch.uint8).as_subclass(cls)
-        pixels.label, pixels.log, pixels.pinned = name, log, pinned
+        pixels.label = name
+        pixels.log = log
+        pixels.pinned = pinned
         return pixels
 
     def is_pinned(self) -> bool:
@@ -424,7 +442,8 @@ class Pixels(torch.Tensor):
         return Pixels.of(self.label, self.log, pinned=True)
 
     def to(self, device: torch.device, non_blocking: bool) -> Pixels:  # type: ignore[override]
-        assert self.pinned and non_blocking, "another copy would make the host wait"
+        assert self.pinned, "another copy would make the host wait"
+        assert non_blocking, "another copy would make the host wait"
         self.log.append(f"{self.label} is copied")
         copied = Pixels.of(self.label, self.log, pinned=False)
         copied.is_cuda = True
@@ -439,14 +458,16 @@ def test_a_step_waits_for_the_copies_of_its_own_images_alone_and_the_host_for_no
     kind: str, monkeypatch: pytest.MonkeyPatch
 ):
     log: list[str] = []
-    copies, training = Stream("copying", log), Stream("training", log)
+    copies = Stream("copying", log)
+    training = Stream("training", log)
     devices: list[Any] = []
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: copies)
     monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "stream", contextlib.nullcontext)
     monkeypatch.setattr(torch.cuda, "current_stream", lambda device: training)
     monkeypatch.setattr(torch.cuda, "set_device", devices.append)
-    pin, wanted = ImagePrefetcher._pinned, threading.Event()
+    pin = ImagePrefetcher._pinned
+    wanted = threading.Event()
     monkeypatch.setattr(
         ImagePrefetcher, "_pinned", lambda prefetcher, index: (index < 2 or wanted.wait()) and pin(prefetcher, index)
     )

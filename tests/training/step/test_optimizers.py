@@ -107,7 +107,8 @@ def assert_same(one: Training, other: Training, tolerance: float = 0.0) -> None:
     for name, value in other.tensors():
         known = expected.pop(name)
         if value.is_cuda or tolerance:
-            value, known = value.to(DEVICE), known.to(DEVICE)
+            value = value.to(DEVICE)
+            known = known.to(DEVICE)
             torch.testing.assert_close({name: value}, {name: known}, atol=max(tolerance, 1e-7), rtol=tolerance or 2e-6)
         else:
             assert torch.equal(value, known), name
@@ -151,7 +152,8 @@ def test_parameters_without_numbers_are_left_out(launches):
     optimizer = training.optimizers.optimizers["features_rest"]
     optimizer.param_groups[0]["params"] = [torch.nn.Parameter(torch.zeros((50, 0, 3), device=DEVICE))]
     training.step(0)
-    assert launches == [5, 1, 1] and not optimizer.state
+    assert launches == [5, 1, 1]
+    assert not optimizer.state
 
 
 def test_gradients_that_are_not_finite_are_named_and_left_out():
@@ -160,7 +162,8 @@ def test_gradients_that_are_not_finite_are_named_and_left_out():
         for step, wrong in enumerate((None, torch.nan, 1e30, None)):
             training.step(step, wrong)
         assert [step for step, _, _ in training.log.read()] == [1, 2]
-        assert all(value.isfinite().all() for _, value in training.tensors())
+        for _, value in training.tensors():
+            assert value.isfinite().all()
     apart, together, by_torch = trainings
     assert_same(apart, together)
     assert_same(by_torch, together, 1e-5)
@@ -179,7 +182,8 @@ def test_the_gaussians_of_the_start_do_not_stay_in_memory():
 @pytest.mark.parametrize("source", ["together", "torch"])
 @pytest.mark.parametrize("target", ["together", "torch"])
 def test_a_checkpoint_goes_on_in_the_other(source, target):
-    first, without_stop = Training(source), Training(target)
+    first = Training(source)
+    without_stop = Training(target)
     for step in range(3):
         first.step(step)
     states = copy.deepcopy({name: o.state_dict() for name, o in first.optimizers.optimizers.items()})

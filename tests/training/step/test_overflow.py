@@ -88,15 +88,18 @@ def state_of(model: SadgsModel) -> dict[str, Tensor]:
 
 def test_a_run_that_foresees_equals_one_that_waits_bit_for_bit(our_rasterizer: None, short: SadgsTrainerConfig):
     short.max_num_iterations = 11
-    forecast, states = Observed(), []
+    forecast = Observed()
+    states = []
     for way in (None, forecast):
         states.append([])
         train(short, way, lambda model, step: states[-1].append(state_of(model)))
-    assert len(forecast.capacities) == 11 and sum(map(bool, forecast.capacities)) > 11 / 3
+    assert len(forecast.capacities) == 11
+    assert sum(map(bool, forecast.capacities)) > 11 / 3
     assert not forecast.lost
     for expected, foreseen in zip(*states, strict=True):
         assert expected.keys() == foreseen.keys()
-        assert all(torch.equal(foreseen[name], value) for name, value in expected.items())
+        for name, value in expected.items():
+            assert torch.equal(foreseen[name], value)
 
 
 def test_steps_whose_lists_are_too_short_change_and_count_nothing_and_their_views_come_again(
@@ -107,12 +110,14 @@ def test_steps_whose_lists_are_too_short_change_and_count_nothing_and_their_view
     """Parameters, moments and statistics stay as they are. Densification follows the steps 4 and 7."""
     monkeypatch.setattr("sadgs_ns.training.step.optimizers.use_triton", lambda place: True)
     too_short = (2, 6, 9)
-    forecast, states = Observed(too_short), []
+    forecast = Observed(too_short)
+    states = []
 
     def look(model: SadgsModel, step: int) -> None:
         states.append(state_of(model))
         if step in (2, 6):
-            assert states[step]["n_total"].sum() > 0 and (step > 4 or states[step]["grad_count"].sum() > 0)
+            assert states[step]["n_total"].sum() > 0
+            assert step > 4 or states[step]["grad_count"].sum() > 0
         same = [torch.equal(value, states[step - 1][name]) for name, value in states[step].items() if step > 0]
         assert all(same) if step in too_short else not all(same) or step == 0
 
@@ -120,18 +125,21 @@ def test_steps_whose_lists_are_too_short_change_and_count_nothing_and_their_view
     assert all(forecast.views[step + 1] == forecast.views[step] for step in too_short)
     assert forecast.lost == [view for step in too_short for view in forecast.views[step]]
     visits = Counter(index for step, views in enumerate(forecast.views) if step not in too_short for index in views)
-    assert max(visits.values()) - min(visits.values()) <= 1 and len(visits) == TRAIN_VIEWS
+    assert max(visits.values()) - min(visits.values()) <= 1
+    assert len(visits) == TRAIN_VIEWS
 
 
 def test_a_checkpoint_after_an_overflow_has_the_views_that_must_be_drawn_again(
     our_rasterizer: None, short: SadgsTrainerConfig
 ):
     short.max_num_iterations = 5
-    forecast, orders = Observed([3]), []
+    forecast = Observed([3])
+    orders = []
     trainer = set_up(short)
     trainer.pipeline.model.tile_forecast = forecast
     location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
     keep = lambda step: orders.append(trainer.pipeline.get_extra_state()["views"]["order"])  # noqa: E731
     trainer.callbacks.append(TrainingCallback(location, keep))
     trainer.train()
-    assert orders[3][:2] == forecast.views[3] and forecast.views[4] == forecast.views[3]
+    assert orders[3][:2] == forecast.views[3]
+    assert forecast.views[4] == forecast.views[3]

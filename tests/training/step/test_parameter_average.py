@@ -10,19 +10,23 @@ from sadgs_ns.training.step.parameter_average import RunningMean
 def test_the_mean_is_that_of_all_that_was_added_in_float64():
     generator = torch.Generator().manual_seed(0)
     iterates = [torch.randn((5, 3), generator=generator) for _ in range(40)]
-    params, average = {"means": torch.nn.Parameter(iterates[0].clone())}, RunningMean()
+    params = {"means": torch.nn.Parameter(iterates[0].clone())}
+    average = RunningMean()
     for iterate in iterates:
         params["means"].data.copy_(iterate)
         average.add(params)
     assert average.count == 40
     average.move_to(params)
     expected = torch.stack(iterates).double().mean(0)
-    torch.testing.assert_close(params["means"].detach().double(), expected, rtol=0, atol=1e-6)
-    assert (average.count, average.means) == (0, {})
+    actual = params["means"].detach().double()
+    torch.testing.assert_close(actual, expected, rtol=0, atol=1e-6)
+    assert average.count == 0
+    assert average.means == {}
 
 
 def test_what_is_added_later_does_not_change_what_was_added():
-    params, average = {"scales": torch.nn.Parameter(torch.ones(2, 3))}, RunningMean()
+    params = {"scales": torch.nn.Parameter(torch.ones(2, 3))}
+    average = RunningMean()
     average.add(params)
     params["scales"].data.fill_(7.0)
     assert torch.equal(average.means["scales"], torch.ones(2, 3))
@@ -31,7 +35,9 @@ def test_what_is_added_later_does_not_change_what_was_added():
 
 def test_it_goes_on_from_a_checkpoint():
     params = {"means": torch.nn.Parameter(torch.tensor([[1.0]]))}
-    whole, first, second = RunningMean(), RunningMean(), RunningMean()
+    whole = RunningMean()
+    first = RunningMean()
+    second = RunningMean()
     for value in (1.0, 5.0, 9.0):
         params["means"].data.fill_(value)
         whole.add(params)
@@ -45,7 +51,8 @@ def test_it_goes_on_from_a_checkpoint():
 
 def test_all_parameters_are_averaged_as_each_by_itself():
     generator = torch.Generator().manual_seed(0)
-    shapes, average = {"means": (7, 3), "opacities": (7, 1), "features_rest": (7, 0, 3)}, RunningMean()
+    shapes = {"means": (7, 3), "opacities": (7, 1), "features_rest": (7, 0, 3)}
+    average = RunningMean()
     expected: dict[str, torch.Tensor] = {}
     for count in (1, 2, 3):
         params = {name: torch.nn.Parameter(torch.randn(shape, generator=generator)) for name, shape in shapes.items()}

@@ -31,7 +31,10 @@ from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15
-WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 14, 1000
+WIDTH = 64
+HEIGHT = 48
+VIEWS = 14
+POINTS = 1000
 """Of the room whose cameras are disturbed."""
 PIXELS = 2.0
 """How far the disturbance moves a camera's image, about."""
@@ -114,8 +117,11 @@ def test_gradients_of_rows_that_are_not_finite_count_as_0_and_are_flagged():
     flag = torch.zeros(1)
     rows = RowUpdate(torch.ones(3, dtype=torch.bool), torch.ones(3, 6))
     move_rows(table, gradient, empty_moments(table), rows, 0.05, BETAS, EPS, flag)
-    assert flag.isnan().all() and table.isfinite().all()
-    assert table[1, 2] == 0 and table[2, 4] == 0 and int((table == 0).sum()) == 2
+    assert flag.isnan().all()
+    assert table.isfinite().all()
+    assert table[1, 2] == 0
+    assert table[2, 4] == 0
+    assert int((table == 0).sum()) == 2
     assert torch.equal(gradient.nan_to_num(), given.nan_to_num()), "the caller's gradients stay"
 
 
@@ -138,7 +144,9 @@ def test_views_that_were_not_drawn_keep_their_poses():
     poses.units = torch.ones(6, 6)
     views = [torch.tensor([4, 0]), torch.tensor([2]), torch.tensor([5])]
     flags = [torch.zeros(1, dtype=torch.int64), torch.ones(1, dtype=torch.int64), None]
-    assert poses.row_update(views, flags).moved.tolist() == [True, False, False, False, True, True]
+    actual = poses.row_update(views, flags).moved.tolist()
+    expected = [True, False, False, False, True, True]
+    assert actual == expected
 
 
 # --- runs ---
@@ -149,7 +157,8 @@ def test_each_step_moves_its_views_alone_but_for_the_common_motion(colmap: Colma
     poses = poses_of(trainer)
     poses.hold_frame = lambda: None  # type: ignore[method-assign]
     trainer.train()
-    assert int((poses.table.detach() != 0).any(dim=1).sum()) == 4
+    actual = int((poses.table.detach() != 0).any(dim=1).sum())
+    assert actual == 4
     in_pixels = poses.table.detach() / poses.units
     assert 0.01 < float(in_pixels.abs().max()) < 0.06, "a step moves about a twentieth of a pixel"
 
@@ -228,7 +237,8 @@ def test_disturbed_cameras_come_closer_to_the_truth_and_the_gauge_holds(tmp_path
     after = errors_in_pixels(trainer, true)
     assert 0.7 * PIXELS < before < 1.6 * PIXELS
     assert after < 0.85 * before
-    assert len(common) == 150 and max(common) < 1e-7
+    assert len(common) == 150
+    assert max(common) < 1e-7
 
 
 @pytest.mark.hard_case("a run that refines poses, stopped and resumed", "goes on bit for bit as if it had not stopped")
@@ -259,9 +269,8 @@ def test_training_views_are_rendered_with_their_refined_poses_and_others_as_they
         expected = corrected(poses.initial[index : index + 1], poses.table[index : index + 1].detach())[0]
         assert torch.equal(found, expected)
         assert torch.equal(pipeline.views.viewmat(index), expected)
-        torch.testing.assert_close(
-            viewmats_from_camera_to_world(poses.camera_to_world(index)[None])[0], expected, rtol=0, atol=1e-6
-        )
+        actual = viewmats_from_camera_to_world(poses.camera_to_world(index)[None])[0]
+        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-6)
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     initial = viewmats_from_camera_to_world(camera.camera_to_worlds)
     assert torch.equal(pipeline.model.pinhole(camera).viewmats, initial)
@@ -288,10 +297,12 @@ def test_ns_render_draws_training_views_with_their_refined_poses(
     render_images.rendered_output_names = ["rgb"]
     render_images.main()
     expected = [trainer.pipeline.views.viewmat(index) for index in range(TRAIN_VIEWS)]
-    torch.testing.assert_close(torch.stack(drawn[:TRAIN_VIEWS]), torch.stack(expected), rtol=0, atol=1e-6)
+    actual = torch.stack(drawn[:TRAIN_VIEWS])
+    torch.testing.assert_close(actual, torch.stack(expected), rtol=0, atol=1e-6)
     assert not torch.allclose(drawn[0], poses_of(trainer).initial[0], rtol=0, atol=1e-6)
     held_out = viewmats_from_camera_to_world(trainer.pipeline.datamanager.eval_dataset.cameras.camera_to_worlds)
-    torch.testing.assert_close(torch.stack(drawn[TRAIN_VIEWS:]), held_out, rtol=0, atol=1e-6)
+    actual = torch.stack(drawn[TRAIN_VIEWS:])
+    torch.testing.assert_close(actual, held_out, rtol=0, atol=1e-6)
 
 
 # --- where poses stay ---
@@ -355,4 +366,5 @@ def test_units_move_an_image_by_one_pixel(colmap: ColmapDataParserConfig, tmp_pa
     depths = (points @ poses.initial[:, 2, :3].T + poses.initial[:, 2, 3]).median(dim=0).values  # [V]
     motion = image_motion(cameras.get_intrinsics_matrices(), sizes, depths[:, None])
     in_pixels = (poses.units.square() * motion.diagonal(dim1=1, dim2=2)).sqrt()
-    assert in_pixels.min() > 0.6 and in_pixels.max() < 1.6
+    assert in_pixels.min() > 0.6
+    assert in_pixels.max() < 1.6

@@ -12,7 +12,8 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from helpers.drawn_textures import energy, photograph, psnr
 from sadgs_ns.training.step.undistortion import Undistortion, Warp, apply_warp
 
-WIDTH, HEIGHT = 360, 240
+WIDTH = 360
+HEIGHT = 240
 FOCAL = 0.9 * WIDTH
 COEFFICIENTS = {
     "OPENCV": (CameraType.PERSPECTIVE, [-0.12, 0.02, 0.0, 0.0, 0.001, -0.001], [-0.12, 0.02, 0.001, -0.001]),
@@ -44,7 +45,9 @@ def test_images_keep_the_detail_of_their_photos(kind: str):
     truth = photograph(pinhole, period)
     warp = undistortion.warp()
     image, mask = undistortion({}, photo, warp)
-    assert warp is not None and mask is None and image.shape == truth.shape
+    assert warp is not None
+    assert mask is None
+    assert image.shape == truth.shape
     bilinear = np.asarray(cv2.remap(photo, warp.x, warp.y, cv2.INTER_LINEAR), np.uint8)
     assert 0.9 <= energy(image) / energy(truth) <= 1.05
     assert energy(bilinear) / energy(truth) < 0.75

@@ -58,7 +58,8 @@ def test_no_view_comes_twice_in_a_step_and_all_come_equally_often(total: int, nu
 def test_a_step_of_more_views_than_there_are_has_all_of_them_equally_often(total: int, number: int):
     for drawn in drawn_by(ViewSampler(total, 0), number, steps=100):
         counts = [drawn.count(index) for index in range(total)]
-        assert len(drawn) == number and max(counts) - min(counts) <= 1
+        assert len(drawn) == number
+        assert max(counts) - min(counts) <= 1
 
 
 @pytest.mark.parametrize(("total", "number"), [(60, 4), (10, 3), (5, 4), (3, 3)])
@@ -103,10 +104,12 @@ def test_each_process_prepares_what_it_composites_and_nothing_else(
         datamanager = Datamanager(total, cache_images="cpu", **options)
         datamanager.cached_train = tuple(datamanager.cached_train)  # type: ignore[assignment]
         world = World()
-        world.rank, world.num_ranks = rank, ranks
+        world.rank = rank
+        world.num_ranks = ranks
         views = views_of(datamanager, world)
         loaded.clear()
-        awaited, taken = 0, Counter[int]()
+        awaited = 0
+        taken = Counter[int]()
         assert views.prefetcher is not None
         for step, of_all in zip(expected, composited, strict=True):
             known = views.prefetcher._loading.keys() | views.prefetcher._sent.keys()
@@ -133,13 +136,16 @@ def test_the_order_is_nerfstudio_s_where_rounds_end_with_steps(total: int, numbe
     while len(order) < 20 * number:
         order += FullImageDatamanager.sample_train_cameras(nerfstudio)
     views = views_of(Datamanager(total, train_cameras_sampling_seed=7))
-    assert [index for step in steps_of(views, number, steps=20) for index in step] == order[: 20 * number]
+    actual = [index for step in steps_of(views, number, steps=20) for index in step]
+    assert actual == order[: 20 * number]
 
 
 def test_a_view_that_is_passed_over_comes_first_in_the_next_step():
     sampler = ViewSampler(4, 0)
     sampler.load_state_dict(sampler.state_dict() | {"order": [2, 3, 3, 0, 2, 1]})
-    assert drawn_by(sampler, 3, steps=2) == [[2, 3, 0], [3, 2, 1]]
+    actual = drawn_by(sampler, 3, steps=2)
+    expected = [[2, 3, 0], [3, 2, 1]]
+    assert actual == expected
 
 
 @pytest.mark.parametrize("foreseen", [0, 5])
@@ -150,11 +156,13 @@ def test_views_that_are_put_back_come_next_and_all_count_equally_often(total: in
     visits: Counter[int] = Counter()
     lost: dict[int, list[int]] = {}
     for step in range(STEPS):
-        sampler.requeue(back := lost.pop(step - 3, []))
+        back = lost.pop(step - 3, [])
+        sampler.requeue(back)
         following = sampler.foresee(number, foreseen)
         drawn = sampler.draw(number)
         assert following[:1] in ([], [drawn])
-        assert len(set(drawn)) == number and set(drawn) >= set(back)
+        assert len(set(drawn)) == number
+        assert set(drawn) >= set(back)
         if step % 7 == 0:
             lost[step] = drawn
         else:
@@ -198,7 +206,9 @@ def test_a_run_on_another_number_of_views_starts_an_order_of_its_own():
     for total in (6, 8):
         sampler = ViewSampler(total, 1)
         sampler.load_state_dict(state)
-        assert drawn_by(sampler, 3, steps=20) == drawn_by(ViewSampler(total, 1), 3, steps=20)
+        actual = drawn_by(sampler, 3, steps=20)
+        expected = drawn_by(ViewSampler(total, 1), 3, steps=20)
+        assert actual == expected
 
 
 def test_another_seed_is_another_order():

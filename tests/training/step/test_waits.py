@@ -37,7 +37,8 @@ def test_no_step_waits_once_every_view_was_visited(
     if not use_triton(trainer.pipeline.device):
         pytest.skip("Triton does not run here")
     stepping = False
-    iterate, wait = trainer.train_iteration, PairCounts.wait
+    iterate = trainer.train_iteration
+    wait = PairCounts.wait
 
     def arrived(counts: PairCounts) -> list[int]:
         assert not stepping or counts.ready()
