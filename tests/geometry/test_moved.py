@@ -9,7 +9,17 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.geometry import moved
-from sadgs_ns.geometry.moved import SmallView, Spread, difference, excess, region, spread, surface_points, working_size
+from sadgs_ns.geometry.moved import (
+    SmallView,
+    Spread,
+    difference,
+    excess,
+    region,
+    spread,
+    structure,
+    surface_points,
+    working_size,
+)
 
 HEIGHT, WIDTH = 40, 60
 WALL = 4.0
@@ -29,7 +39,7 @@ def view_at(x: float, differing: Tensor | None = None, depth: float = WALL, vali
         values[differing] = 0.3
     if valid is None:
         valid = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    return SmallView(values, torch.full((HEIGHT, WIDTH), depth), valid, viewmat, K)
+    return SmallView(values, values.clone(), torch.full((HEIGHT, WIDTH), depth), valid, viewmat, K)
 
 
 def pixels(rows: slice, columns: slice) -> Tensor:
@@ -128,7 +138,7 @@ def test_a_region_covers_what_moved_and_fills_its_holes():
     thing = pixels(*THING)
     values[thing] = 0.3
     values[16:19, 24:27] = 0.0
-    found = region(view_at(0.0), values, LIMITS)
+    found = region(view_at(0.0, thing), values, LIMITS)
     assert found is not None
     assert found[thing.numpy()].all()
     assert found.sum() <= (12 + 2 * moved.DILATION) ** 2
@@ -137,10 +147,34 @@ def test_a_region_covers_what_moved_and_fills_its_holes():
 def test_single_pixels_and_weak_regions_are_none():
     values = torch.zeros(HEIGHT, WIDTH)
     values[::7, ::7] = 0.5
-    assert region(view_at(0.0), values, LIMITS) is None
+    everywhere = view_at(0.0, torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+    assert region(everywhere, values, LIMITS) is None
     values = torch.zeros(HEIGHT, WIDTH)
     values[THING] = 0.5 * (LIMITS.weak + LIMITS.strong)
-    assert region(view_at(0.0), values, LIMITS) is None
+    assert region(everywhere, values, LIMITS) is None
+
+
+def test_another_light_is_no_thing():
+    thing = pixels(*THING)
+    values = torch.zeros(HEIGHT, WIDTH)
+    values[thing] = 0.3
+    view = view_at(0.0, thing)
+    assert region(view, values, LIMITS) is not None
+    view.structure[thing] = 0.05
+    assert region(view, values, LIMITS) is None
+
+
+def test_structure_is_what_does_not_change_slowly():
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    photo = torch.rand((3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(0))
+    light = torch.linspace(0, 0.3, WIDTH).expand(3, HEIGHT, WIDTH)
+    inner = slice(moved.WIDE // 2, -(moved.WIDE // 2))
+    assert float(structure(photo + light, photo, everywhere)[:, inner].max()) < 0.02
+    assert float(difference(photo + light, photo, everywhere)[:, inner].max()) > 0.1
+    thing = photo.clone()
+    rows, columns = THING
+    thing[:, rows, columns] = 1.0
+    assert float(structure(thing, photo, everywhere)[THING].mean()) > 0.1
 
 
 def test_a_region_goes_on_where_the_excess_is_unknown_if_the_pixels_differ_much():
@@ -151,7 +185,9 @@ def test_a_region_goes_on_where_the_excess_is_unknown_if_the_pixels_differ_much(
     upper = thing & values.isnan()
     found = region(view_at(0.0, thing), values, LIMITS)
     assert found is not None and found[upper.numpy()].all()
-    found = region(view_at(0.0), values, LIMITS)
+    alike = view_at(0.0, thing)
+    alike.difference[upper] = 0.0
+    found = region(alike, values, LIMITS)
     assert found is not None and found[upper.numpy()].mean() < 0.5
 
 

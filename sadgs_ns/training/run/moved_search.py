@@ -113,7 +113,9 @@ class MovedSearch:
             size = (cameras.height, cameras.width)
             for color, depth, viewmat, K in zip(colors, depths, cameras.viewmats, cameras.Ks, strict=True):
                 photo, valid = self._small_photo(next(photos), size)
-                views.append(SmallView(moved.difference(photo, color, valid), depth, valid, viewmat, K))
+                difference = moved.difference(photo, color, valid)
+                structure = moved.structure(photo, color, valid)
+                views.append(SmallView(difference, structure, depth, valid, viewmat, K))
         return views
 
     def _batches(self) -> Iterator[list[int]]:
