@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from tyro.conf import Positional
 
-from benchmarks import camera_table, chain_table, table
+from benchmarks import camera_table, chain_table, kernel_table, table
 from benchmarks.table import Change, Run
 from sadgs_ns.files import atomic_path
 
@@ -107,14 +107,15 @@ class Source:
         found = table.groups(self.read(*rows))
         return table.of_sweep(found, labels, scenes)
 
-    def approximations(self, rows: str, of: str, input: str, variants: Sequence[str] | None = None) -> str:
-        """What `approximations` measured in an image, of some variants or of all."""
-        found = {}
-        for row in self.read(rows):
-            if (row["table"], row["input"]) == (of, input):
-                found[row["variant"]] = row
-        shown = variants or found
-        return table.of_approximations([found[name] for name in shown])
+    def kernels(self, rows: str) -> str:
+        """What `benchmarks.kernel_share` measured, a line for each kernel."""
+        return kernel_table.markdown(self.read(rows))
+
+    def startup(self, rows: str) -> str:
+        """What `benchmarks.startup` measured, a line for each way to start."""
+        from benchmarks import startup  # It imports matplotlib, which takes a second.
+
+        return startup.markdown(self.read(rows))
 
     def chain(self, rows: str, labels: Mapping[str, str]) -> str:
         """What `benchmarks.chain` measured, a line for each capture and label."""

@@ -38,7 +38,7 @@ WIDTH = 75
 """Width of the images in px: no multiple of a tile's, or of what a program handles. So is the height."""
 HEIGHT = 50
 VIEWS = 3
-"""Number of views: more than the two whose gradients one launch of the harmonics' kernel sums."""
+"""Number of views."""
 N = 150
 """Number of Gaussians: more than the 128 that a program handles."""
 Results = dict[str, Tensor]

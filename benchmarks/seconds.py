@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -152,9 +153,15 @@ def measure(run: Run, work: Path) -> dict[str, Any]:
             check=True,
         )
         seconds = time.perf_counter() - begin
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
     parts = parts_of(trace.read_text("utf8").splitlines(), run.program, start)
     rounded = [[part.process, part.name, round(part.begin, 3), round(part.end, 3)] for part in parts]
-    return {"seconds": round(seconds, 3), "photos": len(photos_of(photos)), "parts": rounded}
+    return {
+        "seconds": round(seconds, 3),
+        "cpu_seconds": round(used.ru_utime + used.ru_stime, 3),  # Of all processes of the command
+        "photos": len(photos_of(photos)),
+        "parts": rounded,
+    }
 
 
 def link_photos(photos: Path, every: int, folder: Path) -> Path:
@@ -260,7 +267,7 @@ def line(row: Mapping[str, Any]) -> str:
     """Return a row in one line."""
     if row["status"] != "ok":
         return f"{row['key']}: failed: {row['error']}"
-    return f"{row['key']}: {row['photos']} photos, {row['seconds']:.1f} s"
+    return f"{row['key']}: {row['photos']} photos, {row['seconds']:.1f} s, {row['cpu_seconds']:.1f} s on all cores"
 
 
 def main() -> None:

@@ -54,7 +54,9 @@ def markdown(rows: Sequence[Any]) -> str:
         for part in median_parts(group):
             lines.append([scene, label, part.process, part.name, *_cells(part.begin, part.end)])
         total = statistics.median(row["seconds"] for row in group)
-        lines.append([scene, label, "all", f"{len(group)} runs", *_cells(0.0, total)])
+        on_cores = statistics.median(row["cpu_seconds"] for row in group)
+        runs = f"{len(group)} runs, {on_cores:.1f} s on all cores"
+        lines.append([scene, label, "all", runs, *_cells(0.0, total)])
     return grid(_HEADER, lines, names=4)
 
 

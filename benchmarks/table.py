@@ -6,7 +6,6 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from benchmarks.results import Result
 
@@ -470,37 +469,3 @@ def _range(differences: Sequence[str]) -> str:
     if least == most:
         return least
     return f"{least} to {most.lstrip('×')}"
-
-
-def _short(value: float) -> str:
-    if abs(value) >= 100:
-        return f"{value:,.0f}"
-    return f"{value:.2g}"
-
-
-_ERRORS = {"median": "{}, median", "p95": "{}, 95 %", "max": "{}, max", "flips": "η > 1 flips"}
-APPROXIMATIONS: dict[str, dict[str, str]] = {
-    "structure_tensor": {
-        "bytes": "Bytes/px", **{name: header.format("Λ") for name, header in _ERRORS.items()}, "ms": "ms an image"
-    },
-    "footprint": {**{name: header.format("η") for name, header in _ERRORS.items()}, "ms": "ms a view"},
-}  # fmt: skip
-"""Headers of the numbers of the tables that `approximations` measures."""
-
-
-def of_approximations(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows of one of `approximations`' tables; a number that is None is a dash."""
-
-    def cell(name: str, value: float | None) -> str:
-        if value is None:
-            return NOTHING
-        if name in _ERRORS:
-            return f"{_short(100 * value)} %"
-        return _short(value)
-
-    columns = APPROXIMATIONS[rows[0]["table"]]
-    lines = []
-    for row in rows:
-        cells = [cell(name, row[name]) for name in columns]
-        lines.append([row["variant"], *cells])
-    return grid(["Variant", *columns.values()], lines)

@@ -77,8 +77,12 @@ class ScanNetParser(ScanNet):
 
 
 class ColmapParser(ColmapDataParser):
-    """nerfstudio's parser of COLMAP's files, which reads points in a tenth of the time and finds masks by all names."""
+    """nerfstudio's parser of COLMAP's files, which reads points in a tenth of the time and finds masks by all names.
 
+    The poses are read once, and not for each split.
+    """
+
+    _read: dict[str, Any] | None = None  # What `_get_all_images_and_cameras` returned
     _middle: NDArray[np.float64] = np.zeros(3)  # By which the poses were centred, in the frame of the data
 
     def _generate_dataparser_outputs(self, split: str = "train", **options: Any) -> DataparserOutputs:
@@ -87,6 +91,11 @@ class ColmapParser(ColmapDataParser):
         return outputs
 
     def _get_all_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
+        if self._read is None:
+            self._read = self._read_images_and_cameras(recon_dir)
+        return self._read
+
+    def _read_images_and_cameras(self, recon_dir: Path) -> dict[str, Any]:
         config = self.config
         meta = super()._get_all_images_and_cameras(recon_dir)
         if config.masks_path is not None:

@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sadgs_ns.kernels import TILE_SIZE
-from sadgs_ns.kernels.shared import load3, store3
+from sadgs_ns.kernels.shared import load3, reciprocal, store3
 
 SCALE = tl.constexpr(0.8493218002880191)  # √(log2(e) / 2), of offsets in px: exp(-σ) is then exp2 of a plain polynomial
 _FAINTEST = tl.constexpr(0x3B808081)  # Bits of 1/255
@@ -43,21 +43,6 @@ def row(values, ROW: tl.constexpr):
     """Return one row of a block. Adding −0.0 changes nothing, so that the compiler removes the sum."""
     rows = tl.arange(0, values.shape[0])[:, None]
     return tl.sum(tl.where(rows == ROW, values, -0.0), axis=0)
-
-
-if isinstance(row, triton.JITFunction):
-
-    @triton.jit
-    def reciprocal(value):
-        """Return 1 / value in one instruction; Triton's division spends four more on denormals."""
-        return tl.inline_asm_elementwise(
-            "rcp.approx.ftz.f32 $0, $1;", "=r,r", [value], tl.float32, is_pure=True, pack=1
-        )  # fmt: skip
-else:  # Triton's interpreter, which knows no PTX
-
-    @triton.jit
-    def reciprocal(value):
-        return 1 / value
 
 
 @triton.jit

@@ -3,6 +3,9 @@
 gsplat takes all coefficients in one tensor, once per view, while the parameters are two tensors, which the views share.
 Here nothing is concatenated or expanded, and the gradients arrive summed over the views; those by the cameras are sums
 over blocks of Gaussians, which torch adds up.
+
+Three threads have a Gaussian's three channels, a fourth does nothing: so threads beside each other read numbers beside
+each other. A program goes through the views with the coefficients and the sums of their gradients in registers.
 """
 
 from __future__ import annotations
@@ -18,9 +21,7 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, equally_spaced_rows, load3, store3
 
 MAX_DEGREE = 3  # Highest degree that the kernels know
-_LANES = 128  # Gaussians of one program forward
-_BACKWARD_LANES = 32  # Gaussians of one program backward, where each has four threads
-_VIEWS = 2  # Views whose gradients one launch sums in registers; more views take more launches
+_LANES = 32  # Gaussians of one program, where each has four threads
 
 
 @triton.jit
@@ -87,103 +88,121 @@ def _slopes(x, y, z):
     return by_x, by_y, by_z
 
 
-@triton.jit(do_not_specialize=["n", "used", "stride"])
-def _forward(
-    means, viewmats, first, rest, radii, colors, n, used, stride, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr
-):  # fmt: skip
-    """Colours of LANES Gaussians in one view; rows of `rest` lie `stride` numbers apart."""
-    g = tl.program_id(0) * LANES + tl.arange(0, LANES)
-    view = tl.program_id(1)
-    at = view * n + g
-    exists = drawn(radii, at, g < n, PER_GAUSSIAN)
-    x, y, z, _ = _direction(means, viewmats, view, g, exists)
-    basis = _basis(x, y, z)
-    others = rest + g.to(tl.int64) * stride  # in 32 bits, 45 g would overflow from 47.7 million Gaussians
-    r, g_, b = load3(first, 3 * g, exists)
-    red = 0.2820947917738781 * r + 0.5
-    green = 0.2820947917738781 * g_ + 0.5
-    blue = 0.2820947917738781 * b + 0.5
-    for k in tl.static_range(15):
-        r, g_, b = load3(others, 3 * k, exists & (k < used))
-        red = red + basis[k] * r
-        green = green + basis[k] * g_
-        blue = blue + basis[k] * b
-    # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
-    red = tl.maximum(red, 0.0, tl.PropagateNan.ALL)
-    green = tl.maximum(green, 0.0, tl.PropagateNan.ALL)
-    store3(colors, 3 * at, red, green, tl.maximum(blue, 0.0, tl.PropagateNan.ALL), g < n)
+@triton.jit
+def _threads(program, LANES: tl.constexpr):
+    """Return the index of each thread's Gaussian, and its channel. [4 · LANES] each
+
+    With blocks [LANES, 4] Triton would lay loads out in several ways, and move what they load from thread to thread.
+    """
+    thread = tl.arange(0, 4 * LANES)
+    return program * LANES + thread // 4, thread % 4
 
 
 @triton.jit
-def _add(sums, basis, v):
-    """Sums of the coefficients' gradients [LANES, 4] with one view's added."""
-    added = ()
+def _over_channels(values):
+    """Sum over the threads of each Gaussian, and return the sum in each of them."""
+    by_channel = tl.reshape(values, [values.shape[0] // 4, 4])
+    sums = tl.sum(by_channel, 1)[:, None] + tl.zeros_like(by_channel)
+    return tl.reshape(sums, [values.shape[0]])
+
+
+@triton.jit
+def _coefficients(rest, radii, at, mine, g, n, num_views, used, PER_GAUSSIAN: tl.constexpr):
+    """Load the coefficients 1 … 15 of the Gaussians that a view drew, from index `at` on; 0 stands for others."""
+    visible = mine & (num_views < 0)
+    for view in range(num_views):
+        visible = visible | drawn(radii, view * n + g, mine, PER_GAUSSIAN)
+    values = ()
     for k in tl.static_range(15):
-        added = added + (sums[k] + basis[k][:, None] * v,)  # noqa: RUF005 (Triton knows no starred expressions)
-    return added
+        value = tl.load(rest + at + 3 * k, visible & (k < used), 0.0).to(tl.float32)
+        values = values + (value,)  # noqa: RUF005 (Triton knows no starred expressions)
+    return values
+
+
+@triton.jit(do_not_specialize=["n", "num_views", "used", "stride"])
+def _forward(
+    means, viewmats, first, rest, radii, colors, n, num_views, used, stride,
+    PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
+):  # fmt: skip
+    """Colours of LANES Gaussians in all views; rows of `rest` lie `stride` numbers apart."""
+    g, channel = _threads(tl.program_id(0), LANES)
+    mine = (g < n) & (channel < 3)
+    at_rest = g.to(tl.int64) * stride + channel  # in 32 bits, 45 g would overflow from 47.7 million Gaussians
+    coefficients = _coefficients(rest, radii, at_rest, mine, g, n, num_views, used, PER_GAUSSIAN)
+    middle = 0.2820947917738781 * tl.load(first + 3 * g + channel, mine, 0.0) + 0.5
+    for view in range(num_views):
+        at = view * n + g
+        exists = drawn(radii, at, mine, PER_GAUSSIAN)
+        x, y, z, _ = _direction(means, viewmats, view, g, exists)
+        basis = _basis(x, y, z)
+        color = middle
+        for k in tl.static_range(15):
+            color = color + basis[k] * coefficients[k]
+        # A broken coefficient must show in the image, where it is found; a maximum that drops NaN would paint it black.
+        color = tl.maximum(color, 0.0, tl.PropagateNan.ALL)
+        tl.store(colors + 3 * at + channel, tl.where(exists, color, 0.5), mine)
 
 
 # The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
-@triton.jit(
-    do_not_specialize=["n", "start", "num_views", "used", "stride", "row"], do_not_specialize_on_alignment=["v_colors"]
-)
+@triton.jit(do_not_specialize=["n", "num_views", "used", "stride", "row"], do_not_specialize_on_alignment=["v_colors"])
 def _backward(
     means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_centres,
-    n, start, num_views, used, stride, row,
-    POSES: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr, VIEWS: tl.constexpr,
+    n, num_views, used, stride, row,
+    POSES: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Add the gradients of VIEWS views to those of the views before `start`.
+    """Write the gradients, summed over the views; rows of `v_colors` lie `row` numbers apart.
 
-    Three threads have a Gaussian's three channels, a fourth does nothing. Rows of `v_colors` lie `row` numbers apart.
     With POSES, also write minus the gradients by the cameras' centres, summed over this program's Gaussians.
     [C, programs, 3]
     """
-    g = tl.program_id(0) * LANES + tl.arange(0, LANES)
-    channel = tl.arange(0, 4)[None, :]
-    mine = (g < n)[:, None] & (channel < 3)  # [LANES, 4]
-    at_others = (g.to(tl.int64) * stride)[:, None] + channel  # in 64 bits as forward
-    earlier = mine & (start > 0)
-    v_sum = tl.zeros([LANES, 4], tl.float32)
-    v_x, v_y, v_z = load3(v_means, 3 * g, (g < n) & (start > 0))
-    sums = (v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum, v_sum)
-    for i in tl.static_range(VIEWS):
-        view = tl.minimum(start + i, num_views - 1)
+    g, channel = _threads(tl.program_id(0), LANES)
+    mine = (g < n) & (channel < 3)
+    at_rest = g.to(tl.int64) * stride + channel  # in 64 bits as forward
+    coefficients = _coefficients(rest, radii, at_rest, mine, g, n, num_views, used, PER_GAUSSIAN)
+    zero = tl.zeros([4 * LANES], tl.float32)
+    v_sum = zero
+    v_x = zero
+    v_y = zero
+    v_z = zero
+    sums = (zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    for view in range(num_views):
         at = view * n + g
-        exists = drawn(radii, at, (g < n) & (start + i < num_views), PER_GAUSSIAN)
-        x, y, z, inverse = _direction(means, viewmats, view, g, exists)
-        seen = exists[:, None] & mine
-        v = tl.load(v_colors + at.to(tl.int64)[:, None] * row + channel, seen, 0.0)
+        seen = drawn(radii, at, mine, PER_GAUSSIAN)
+        v = tl.load(v_colors + at.to(tl.int64) * row + channel, seen, 0.0)
         # A colour that was clamped to 0 passes no gradient on.
-        v = tl.where(tl.load(colors + 3 * at[:, None] + channel, seen, 0.0) > 0, v, 0.0)
-        v_sum += v
-        sums = _add(sums, _basis(x, y, z), v)
+        v = tl.where(tl.load(colors + 3 * at + channel, seen, 0.0) > 0, v, 0.0)
+        x, y, z, inverse = _direction(means, viewmats, view, g, seen)
+        basis = _basis(x, y, z)
         slope_x, slope_y, slope_z = _slopes(x, y, z)
-        dx = tl.zeros([LANES], tl.float32)
-        dy = dx
-        dz = dx
+        v_sum += v
+        dx = zero
+        dy = zero
+        dz = zero
+        added = ()
         for k in tl.static_range(15):
-            shade = tl.sum(v * tl.load(rest + at_others + 3 * k, seen & (k < used), 0.0), 1)
-            dx = dx + slope_x[k] * shade
-            dy = dy + slope_y[k] * shade
-            dz = dz + slope_z[k] * shade
+            added = added + (sums[k] + basis[k] * v,)  # noqa: RUF005
+            shade = v * coefficients[k]
+            dx += slope_x[k] * shade
+            dy += slope_y[k] * shade
+            dz += slope_z[k] * shade
+        sums = added
+        # What follows is linear, so that the channels are added after the views.
         along = dx * x + dy * y + dz * z
         by_x = (dx - along * x) * inverse
         by_y = (dy - along * y) * inverse
         by_z = (dz - along * z) * inverse
-        v_x = v_x + by_x
-        v_y = v_y + by_y
-        v_z = v_z + by_z
+        v_x += by_x
+        v_y += by_y
+        v_z += by_z
         if POSES:
             part = v_centres + 3 * (tl.cast(view, tl.int64) * tl.num_programs(0) + tl.program_id(0))
-            store3(part, 0, tl.sum(by_x), tl.sum(by_y), tl.sum(by_z), start + i < num_views)
-    at_first = 3 * g[:, None] + channel
-    v_sum = 0.2820947917738781 * v_sum + tl.load(v_first + at_first, earlier, 0.0)
-    tl.store(v_first + at_first, v_sum, mine)
+            store3(part, 0, tl.sum(by_x), tl.sum(by_y), tl.sum(by_z), True)
+    tl.store(v_first + 3 * g + channel, 0.2820947917738781 * v_sum, mine)
     for k in tl.static_range(15):
-        at_rest = v_rest + at_others + 3 * k
-        value = tl.where(k < used, sums[k], 0.0) + tl.load(at_rest, earlier & (3 * k < stride), 0.0)
-        tl.store(at_rest, value, mine & (3 * k < stride))
-    store3(v_means, 3 * g, v_x, v_y, v_z, g < n)
+        tl.store(v_rest + at_rest + 3 * k, tl.where(k < used, sums[k], 0.0), mine & (3 * k < stride))
+    v_mean = tl.where(channel == 0, _over_channels(v_x), _over_channels(v_y))
+    v_mean = tl.where(channel == 2, _over_channels(v_z), v_mean)
+    tl.store(v_means + 3 * g + channel, v_mean, mine)
 
 
 class _Colors(torch.autograd.Function):
@@ -193,8 +212,10 @@ class _Colors(torch.autograd.Function):
     ) -> Tensor:
         num_views, n = radii.shape[:2]
         colors = means.new_empty((num_views, n, 3))
-        grid = (cdiv(n, _LANES), num_views)
-        _forward[grid](means, viewmats, first, rest, radii, colors, n, used, rest.shape[1] * 3, radii.dim() - 1, _LANES)
+        _forward[cdiv(n, _LANES),](
+            means, viewmats, first, rest, radii, colors,
+            n, num_views, used, rest.shape[1] * 3, radii.dim() - 1, _LANES,
+        )  # fmt: skip
         ctx.save_for_backward(means, rest, viewmats, radii, colors)
         ctx.used = used
         return colors
@@ -210,17 +231,15 @@ class _Colors(torch.autograd.Function):
         written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
         v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
         v_colors, row = equally_spaced_rows(v_colors, colors)
-        programs = cdiv(n, _BACKWARD_LANES)
+        programs = cdiv(n, _LANES)
         moves_cameras = ctx.needs_input_grad[3]
         sums = means  # The kernel does not read what stands in.
         if moves_cameras:
             sums = means.new_empty((num_views, programs, 3))
-        for start in range(0, num_views, _VIEWS):
-            _backward[programs,](
-                means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, sums,
-                n, start, num_views, ctx.used, rest.shape[1] * 3, row,
-                moves_cameras, radii.dim() - 1, _BACKWARD_LANES, _VIEWS,
-            )  # fmt: skip
+        _backward[programs,](
+            means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, sums,
+            n, num_views, ctx.used, rest.shape[1] * 3, row, moves_cameras, radii.dim() - 1, _LANES,
+        )  # fmt: skip
         v_viewmats = None
         if moves_cameras:
             v_viewmats = _by_matrices(viewmats, sums.sum(dim=1))

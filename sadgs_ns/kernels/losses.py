@@ -1,4 +1,8 @@
-"""`method.losses.photometric_loss` in five kernels: separable blurs and sums forward, the blurs' adjoints backward.
+"""`method.losses.photometric_loss` in three kernels: SSIM and differences, their sum, and the gradient.
+
+A program walks down a strip of the image, a row at a time. It blurs the row from neighbours that the cache holds, and
+adds the result to the ten windows that have begun above and are not complete, which stay in registers. So no blurred
+map passes through memory: forward writes three derivatives of SSIM, which backward blurs in the same way.
 
 Images stay [C, H, W, 3]: a row has 3W numbers, and a horizontal neighbour lies 3 numbers away. The window is symmetric,
 so that the adjoint of a blur is the same blur of the zero-padded map. Specialised sizes would make Triton compile anew.
@@ -16,12 +20,13 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pixels
-from sadgs_ns.kernels.shared import load3, store3
+from sadgs_ns.kernels.shared import reciprocal, store3
 
-_STRIP = 256  # Numbers along the rows that one program handles
-_RUN = 8  # Rows of numbers that one program handles
 _COLUMNS = 128  # Columns of numbers that one program handles
-_LANES = 4096  # Partial sums that are added at once
+_PROGRAMS = 792  # Programs that one launch has at most, if it can: so many an H100 or H200 runs at a time
+_FEWEST_ROWS = 16  # Least rows of a strip; ten more are read for each
+_LANES = 1024  # Partial sums that are added at once
+_MARGIN = tl.constexpr(32)  # Zeros before the first row of derivatives; a window reaches 30 numbers to the left
 
 
 @triton.jit
@@ -33,105 +38,115 @@ def _target(y, i, exists):
     return value
 
 
-# One view of several may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
-@triton.jit(do_not_specialize=["n"], do_not_specialize_on_alignment=["y"])
-def _blur_along_rows(x, y, blurred, sums, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """Blur x, y, x², y² and xy along the rows, and sum |x − y| and (x − y)² in parts.
-
-    The window begins at each number. Values of windows that leave the row are never read.
-    """
-    i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
-    inside = i < n
-    e_x = tl.zeros([STRIP], tl.float32)
-    e_y = e_x
-    e_xx = e_x
-    e_yy = e_x
-    e_xy = e_x
-    for k in tl.static_range(len(GAUSSIAN)):
-        exists = i < n - 3 * k
-        a = tl.load(x + i + 3 * k, exists, 0.0)
-        b = _target(y, i + 3 * k, exists)
-        wa = GAUSSIAN[k] * a
-        wb = GAUSSIAN[k] * b
-        e_x = e_x + wa
-        e_y = e_y + wb
-        e_xx = e_xx + wa * a
-        e_yy = e_yy + wb * b
-        e_xy = e_xy + wa * b
-    size = tl.cast(n, tl.int64)
-    store3(blurred, i, e_x, e_y, e_xx, inside, size)
-    tl.store(blurred + 3 * size + i, e_yy, inside)
-    tl.store(blurred + 4 * size + i, e_xy, inside)
-    difference = tl.load(x + i, inside, 0.0) - _target(y, i, inside)
-    tl.store(sums + tl.program_id(0), tl.sum(tl.abs(difference)))
-    tl.store(sums + tl.num_programs(0) + tl.program_id(0), tl.sum(difference * difference))
+@triton.jit
+def _no_windows(GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr):
+    """Return the windows of `_add_row` before the first row."""
+    windows = ()
+    for _ in tl.static_range(len(GAUSSIAN) - 1):
+        windows = windows + (tl.zeros([COLUMNS], tl.float32),)  # noqa: RUF005 (Triton knows no starred expressions)
+    return windows
 
 
 @triton.jit
-def _blur_along_columns(x, i, row, begin, end, exists, GAUSSIAN: tl.constexpr, RUN: tl.constexpr):
-    """Blur RUN numbers below each other in the columns from i on; rows from `begin` to `end` exist.
+def _add_row(windows, value, GAUSSIAN: tl.constexpr):
+    """Add a row to the windows along the columns that contain it.
 
-    Each number is loaded once for all of them: with loads for each by itself the kernels took 255 registers, not 96.
+    Returns:
+        The sum of the window that ends with this row, and those of the windows that have begun, the oldest first.
     """
-    zero = tl.zeros_like(i).to(tl.float32)
-    blurred = ()
-    for _ in tl.static_range(RUN):
-        blurred = blurred + (zero,)  # noqa: RUF005 (Triton knows no starred expressions)
-    for k in tl.static_range(RUN + len(GAUSSIAN) - 1):
-        value = tl.load(x + i + k * row, exists & (k >= begin) & (k < end), 0.0)
-        added = ()
-        for t in tl.static_range(RUN):
-            if k >= t and k - t < len(GAUSSIAN):
-                added = added + (blurred[t] + GAUSSIAN[k - t] * value,)  # noqa: RUF005
-            else:
-                added = added + (blurred[t],)  # noqa: RUF005
-        blurred = added
-    return blurred
+    open_windows = ()
+    for k in tl.static_range(1, len(GAUSSIAN) - 1):
+        open_windows = open_windows + (windows[k] + GAUSSIAN[k] * value,)  # noqa: RUF005
+    return windows[0] + GAUSSIAN[0] * value, open_windows + (GAUSSIAN[0] * value,)  # noqa: RUF005
 
 
-@triton.jit(do_not_specialize=["n", "height", "row"])
-def _similarity(
-    blurred, slopes, sums, n, height, row, GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr
-):
-    """Blur along the columns, sum SSIM in parts, and write its derivatives by E[x], E[x²] and E[xy].
+@triton.jit
+def _slopes(e_x, e_y, e_xx, e_yy, e_xy):
+    """Return SSIM of windows, and its derivatives by E[x], E[x²] and E[xy].
 
-    The derivatives are 0 where no whole window begins.
+    It depends on E[x²] + E[y²] alone, but one blur of both would err more where a photo is white.
     """
-    c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
-    first = tl.program_id(1) * RUN
-    exists = c < row - 3 * (len(GAUSSIAN) - 1)
-    i = (tl.program_id(2) * height + first) * row + c
-    size = tl.cast(n, tl.int64)
-    x = _blur_along_columns(blurred, i, row, 0, height - first, exists, GAUSSIAN, RUN)
-    y = _blur_along_columns(blurred + size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
-    xx = _blur_along_columns(blurred + 2 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
-    yy = _blur_along_columns(blurred + 3 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
-    xy = _blur_along_columns(blurred + 4 * size, i, row, 0, height - first, exists, GAUSSIAN, RUN)
     c1 = 0.01 * 0.01
     c2 = 0.03 * 0.03
-    similarity = tl.zeros([COLUMNS], tl.float32)
-    for t in tl.static_range(RUN):
-        e_x = x[t]
-        e_y = y[t]
-        e_xx = xx[t]
-        e_yy = yy[t]
-        e_xy = xy[t]
-        valid = exists & (first + t < height - (len(GAUSSIAN) - 1))
-        of_means = 1 / (e_x * e_x + e_y * e_y + c1)
-        luminance = (2 * e_x * e_y + c1) * of_means
-        of_variances = 1 / (e_xx - e_x * e_x + e_yy - e_y * e_y + c2)
-        structure = (2 * (e_xy - e_x * e_y) + c2) * of_variances
-        by_xx = -luminance * structure * of_variances
-        by_xy = 2 * luminance * of_variances
-        by_x = 2 * (e_y - e_x * luminance) * of_means * structure - 2 * e_x * by_xx - e_y * by_xy
-        inside = (c < row) & (first + t < height)
-        by_x = tl.where(valid, by_x, 0.0)
-        by_xx = tl.where(valid, by_xx, 0.0)
-        by_xy = tl.where(valid, by_xy, 0.0)
-        store3(slopes, i + t * row, by_x, by_xx, by_xy, inside, size)
-        similarity += tl.where(valid, luminance * structure, 0.0)
+    of_means = reciprocal(e_x * e_x + e_y * e_y + c1)
+    luminance = (2 * e_x * e_y + c1) * of_means
+    of_variances = reciprocal(e_xx - e_x * e_x + e_yy - e_y * e_y + c2)
+    structure = (2 * (e_xy - e_x * e_y) + c2) * of_variances
+    by_xx = -luminance * structure * of_variances
+    by_xy = 2 * luminance * of_variances
+    by_x = 2 * (e_y - e_x * luminance) * of_means * structure - 2 * e_x * by_xx - e_y * by_xy
+    return luminance * structure, by_x, by_xx, by_xy
+
+
+# One view of several may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
+@triton.jit(do_not_specialize=["n", "height", "row", "rows"], do_not_specialize_on_alignment=["y"])
+def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr):
+    """Sum SSIM, |x − y| and (x − y)² of a strip, and write SSIM's derivatives by E[x], E[x²] and E[xy].
+
+    The derivatives lie where a window begins, and are 0 where no whole window does. `_MARGIN` zeros precede the first,
+    so that before each row of each map lie the zeros of another's end.
+    """
+    reach = tl.constexpr(len(GAUSSIAN) - 1)
+    c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+    first = tl.program_id(1) * rows
+    last = tl.minimum(first + rows, height)
+    inside = c < row
+    whole = c < row - 3 * reach
+    # What begins too far to the right is moved into the image: loads need no mask, and nothing reads the result.
+    begin = tl.minimum(c, row - 3 * reach - 1)
+    top = tl.program_id(2) * height * row
+    size = tl.cast(n, tl.int64)
+    zero = tl.zeros([COLUMNS], tl.float32)
+    similarity = zero
+    absolute = zero
+    square = zero
+    of_x = _no_windows(GAUSSIAN, COLUMNS)
+    of_y = of_x
+    of_xx = of_x
+    of_yy = of_x
+    of_xy = of_x
+    for r in range(first, tl.minimum(last + reach, height)):
+        x_row = x + (top + r * row + begin)
+        y_row = y + (top + r * row + begin)
+        e_x = zero
+        e_y = zero
+        e_xx = zero
+        e_yy = zero
+        e_xy = zero
+        for k in tl.static_range(len(GAUSSIAN)):
+            a = tl.load(x_row + 3 * k)
+            b = _target(y_row, 3 * k, True)
+            wa = GAUSSIAN[k] * a
+            wb = GAUSSIAN[k] * b
+            e_x += wa
+            e_y += wb
+            e_xx += wa * a
+            e_yy += wb * b
+            e_xy += wa * b
+        e_x, of_x = _add_row(of_x, e_x, GAUSSIAN)
+        e_y, of_y = _add_row(of_y, e_y, GAUSSIAN)
+        e_xx, of_xx = _add_row(of_xx, e_xx, GAUSSIAN)
+        e_yy, of_yy = _add_row(of_yy, e_yy, GAUSSIAN)
+        e_xy, of_xy = _add_row(of_xy, e_xy, GAUSSIAN)
+        i = top + r * row + c
+        counted = inside & (r < last)
+        difference = tl.load(x + i, counted, 0.0) - _target(y, i, counted)
+        absolute += tl.abs(difference)
+        square += difference * difference
+        if r >= first + reach:  # The windows that end here have begun in this strip.
+            of_window, by_x, by_xx, by_xy = _slopes(e_x, e_y, e_xx, e_yy, e_xy)
+            similarity += tl.where(whole, of_window, 0.0)
+            by_x = tl.where(whole, by_x, 0.0)
+            by_xx = tl.where(whole, by_xx, 0.0)
+            by_xy = tl.where(whole, by_xy, 0.0)
+            store3(slopes, _MARGIN + i - reach * row, by_x, by_xx, by_xy, inside, size)
+    for r in range(tl.maximum(first, height - reach), last):
+        store3(slopes, _MARGIN + top + r * row + c, zero, zero, zero, inside, size)
     program = (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0)
-    tl.store(sums + program, tl.sum(similarity))
+    if program == 0:
+        tl.store(slopes + tl.arange(0, _MARGIN), tl.zeros([_MARGIN], tl.float32))
+    programs = tl.num_programs(0) * tl.num_programs(1) * tl.num_programs(2)
+    store3(sums, program, tl.sum(similarity), tl.sum(absolute), tl.sum(square), True, programs)
 
 
 @triton.jit
@@ -144,64 +159,71 @@ def _total(values, count, LANES: tl.constexpr):
     return tl.sum(sums)
 
 
-@triton.jit(do_not_specialize=["n", "num_strips", "num_tiles", "num_parts"])
+@triton.jit(do_not_specialize=["n", "num_programs", "num_parts"])
 def _finish(
-    differences, similarities, parts, loss, psnr, n, num_strips, num_tiles, num_parts,
+    sums, parts, loss, psnr, n, num_programs, num_parts,
     ssim_lambda, l1_weight, ssim_weight, l2_weight, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Compute the loss and PSNR from the partial sums, in one program, and add the sum of `parts` to the loss."""
-    absolute = _total(differences, num_strips, LANES)
-    square = _total(differences + num_strips, num_strips, LANES)
-    of_ssim = ssim_lambda - ssim_weight * _total(similarities, num_tiles, LANES)
-    photometric = l1_weight * absolute + of_ssim + l2_weight * square
+    """Compute the loss and PSNR from the sums of `_similarity`, in one program, and add that of `parts` to the loss."""
+    similarity = _total(sums, num_programs, LANES)
+    absolute = _total(sums + num_programs, num_programs, LANES)
+    square = _total(sums + 2 * num_programs, num_programs, LANES)
+    photometric = l1_weight * absolute + (ssim_lambda - ssim_weight * similarity) + l2_weight * square
     tl.store(loss + tl.program_id(0), photometric + _total(parts, num_parts, LANES))
     mse = square / n
     decibels = -3.010299956639812 * tl.log2(tl.where(mse > 0, mse, 1.0))
     tl.store(psnr + tl.program_id(0), tl.where(mse > 0, decibels, tl.where(mse == 0, float("inf"), mse)))
 
 
-@triton.jit(do_not_specialize=["n"])
-def _spread_along_rows(slopes, spread, n, GAUSSIAN: tl.constexpr, STRIP: tl.constexpr):
-    """Apply the blur's adjoint along the rows to three derivatives; before a row lie the zeros of another's end."""
-    i = tl.program_id(0) * STRIP + tl.arange(0, STRIP)
-    size = tl.cast(n, tl.int64)
-    by_x = tl.zeros([STRIP], tl.float32)
-    by_xx = by_x
-    by_xy = by_x
-    for k in tl.static_range(len(GAUSSIAN)):
-        exists = (i < n) & (i >= 3 * k)
-        x, xx, xy = load3(slopes, i - 3 * k, exists, size)
-        by_x = by_x + GAUSSIAN[k] * x
-        by_xx = by_xx + GAUSSIAN[k] * xx
-        by_xy = by_xy + GAUSSIAN[k] * xy
-    store3(spread, i, by_x, by_xx, by_xy, i < n, size)
-
-
-@triton.jit(do_not_specialize=["n", "height", "row"], do_not_specialize_on_alignment=["y"])
+@triton.jit(do_not_specialize=["n", "height", "row", "rows"], do_not_specialize_on_alignment=["y"])
 def _gradient(
-    x, y, spread, upstream, gradient, n, height, row, l1_weight, ssim_weight, l2_weight,
-    GAUSSIAN: tl.constexpr, RUN: tl.constexpr, COLUMNS: tl.constexpr,
+    x, y, slopes, upstream, gradient, n, height, row, rows, l1_weight, ssim_weight, l2_weight,
+    GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Apply the blur's adjoint along the columns, and compute with it the gradient of the whole loss by x."""
+    """Compute the gradient of the whole loss by x, with the adjoint of the blur of a strip's derivatives."""
+    reach = tl.constexpr(len(GAUSSIAN) - 1)
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
-    first = tl.program_id(1) * RUN
-    exists = c < row
-    i = (tl.program_id(2) * height + first) * row + c
+    first = tl.program_id(1) * rows
+    last = tl.minimum(first + rows, height)
+    inside = c < row
+    end = tl.minimum(c, row - 1)  # Loads need no mask.
+    top = tl.program_id(2) * height * row
     size = tl.cast(n, tl.int64)
-    above = tl.constexpr(len(GAUSSIAN) - 1)
-    begin = above - first
-    end = height - first
-    by_x = _blur_along_columns(spread, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
-    by_xx = _blur_along_columns(spread + size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
-    by_xy = _blur_along_columns(spread + 2 * size, i - above * row, row, begin, end, exists, GAUSSIAN, RUN)
-    for t in tl.static_range(RUN):
-        inside = exists & (first + t < height)
-        a = tl.load(x + i + t * row, inside, 0.0)
-        b = _target(y, i + t * row, inside)
-        sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
-        of_ssim = by_x[t] + 2 * a * by_xx[t] + b * by_xy[t]
-        total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
-        tl.store(gradient + i + t * row, tl.load(upstream) * total, inside)
+    zero = tl.zeros([COLUMNS], tl.float32)
+    factor = tl.load(upstream)
+    of_x = _no_windows(GAUSSIAN, COLUMNS)
+    of_xx = of_x
+    of_xy = of_x
+    for r in range(tl.maximum(first - reach, 0), last):
+        by_x_row = slopes + _MARGIN + (top + r * row + end)
+        by_xx_row = by_x_row + size
+        by_xy_row = by_xx_row + size
+        by_x = zero
+        by_xx = zero
+        by_xy = zero
+        for k in tl.static_range(len(GAUSSIAN)):
+            by_x += GAUSSIAN[k] * tl.load(by_x_row - 3 * k)
+            by_xx += GAUSSIAN[k] * tl.load(by_xx_row - 3 * k)
+            by_xy += GAUSSIAN[k] * tl.load(by_xy_row - 3 * k)
+        by_x, of_x = _add_row(of_x, by_x, GAUSSIAN)
+        by_xx, of_xx = _add_row(of_xx, by_xx, GAUSSIAN)
+        by_xy, of_xy = _add_row(of_xy, by_xy, GAUSSIAN)
+        if r >= first:
+            i = top + r * row + c
+            a = tl.load(x + i, inside, 0.0)
+            b = _target(y, i, inside)
+            sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
+            of_ssim = by_x + 2 * a * by_xx + b * by_xy
+            total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
+            tl.store(gradient + i, factor * total, inside)
+
+
+def _strips(views: int, height: int, row: int) -> tuple[tuple[int, int, int], int]:
+    """Return the grid of programs, and how many rows of an image each handles, so that all run at the same time."""
+    columns = cdiv(row, _COLUMNS)
+    most_strips = max(_PROGRAMS // (columns * views), 1)
+    rows = max(cdiv(height, most_strips), _FEWEST_ROWS)
+    return (columns, cdiv(height, rows), views), rows
 
 
 class _PhotometricLoss(torch.autograd.Function):
@@ -213,14 +235,10 @@ class _PhotometricLoss(torch.autograd.Function):
         views, height, width, _ = x.shape
         n = x.numel()
         row = 3 * width
-        blurred = x.new_empty((5, n))
-        slopes = x.new_empty((3, n))
-        strips = cdiv(n, _STRIP)
-        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
-        differences = x.new_empty((2, strips))
-        similarities = x.new_empty(math.prod(tiles))
-        _blur_along_rows[strips,](x, y, blurred, differences, n, window, _STRIP)
-        _similarity[tiles](blurred, slopes, similarities, n, height, row, window, _RUN, _COLUMNS)
+        grid, rows = _strips(views, height, row)
+        slopes = x.new_empty(_MARGIN.value + 3 * n)
+        sums = x.new_empty((3, math.prod(grid)))
+        _similarity[grid](x, y, slopes, sums, n, height, row, rows, window, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
         ctx.window = window
         ctx.num_parts = 0 if parts is None else len(parts)
@@ -229,8 +247,8 @@ class _PhotometricLoss(torch.autograd.Function):
         loss = x.new_empty(())
         psnr = x.new_empty(())
         _finish[1,](
-            differences, similarities, differences if parts is None else parts, loss, psnr,
-            n, strips, similarities.numel(), ctx.num_parts, ssim_lambda, *ctx.weights, _LANES, num_warps=8,
+            sums, sums if parts is None else parts, loss, psnr,
+            n, math.prod(grid), ctx.num_parts, ssim_lambda, *ctx.weights, _LANES,
         )  # fmt: skip
         ctx.mark_non_differentiable(psnr)
         ctx.set_materialize_grads(False)  # torch would fill PSNR's gradient with zeros on the device
@@ -241,13 +259,11 @@ class _PhotometricLoss(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
         x, y, slopes = ctx.saved_tensors
         views, height, width, _ = x.shape
-        n = x.numel()
-        row = 3 * width
-        spread = torch.empty_like(slopes)
         gradient = torch.empty_like(x)
-        tiles = (cdiv(row, _COLUMNS), cdiv(height, _RUN), views)
-        _spread_along_rows[cdiv(n, _STRIP),](slopes, spread, n, ctx.window, _STRIP)
-        _gradient[tiles](x, y, spread, upstream, gradient, n, height, row, *ctx.weights, ctx.window, _RUN, _COLUMNS)
+        grid, rows = _strips(views, height, 3 * width)
+        _gradient[grid](
+            x, y, slopes, upstream, gradient, x.numel(), height, 3 * width, rows, *ctx.weights, ctx.window, _COLUMNS
+        )
         return gradient, *[None] * 4, upstream.expand(ctx.num_parts) if ctx.num_parts else None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from PIL import Image
 
 from sadgs_ns.data.images import image_size
 from sadgs_ns.events import progress
+from sadgs_ns.placing.matching_ahead import PhotoFeatures
 from sadgs_ns.placing.panoramas import VIEWS, rotations
 from sadgs_ns.placing.photos import threads, threads_in_memory
 
@@ -28,11 +29,18 @@ _BYTES_PER_PIXEL = 240  # Memory of OpenCV for features, as measured; it doubles
 _AT_ONCE = 256  # Photos whose features are kept, at 1 MB each, until COLMAP has read the photos and they are saved
 
 
-def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs: Sequence[Sequence[str]] = ()) -> None:
+def extract(
+    photos: Path,
+    groups: Sequence[Sequence[str]],
+    database: Path,
+    rigs: Sequence[Sequence[str]] = (),
+    on_features: Callable[[PhotoFeatures], None] | None = None,
+) -> None:
     """Find SIFT features in the photos of a folder that have none in COLMAP's database yet, which is made if need be.
 
     In `groups` the names of one camera's photos are together, in `rigs` those of one panorama's views. The folder
-    `masks` beside the database may hold masks, as `write_masks` writes them.
+    `masks` beside the database may hold masks, as `write_masks` writes them. `on_features` is called with the features
+    of each photo when they are saved.
     """
     names = list(itertools.chain(*groups, *rigs))
     progress("features", 0, len(names))
@@ -55,6 +63,8 @@ def extract(photos: Path, groups: Sequence[Sequence[str]], database: Path, rigs:
                     with pycolmap.DatabaseTransaction(opened):
                         opened.write_keypoints(image.image_id, keypoints)
                         opened.write_descriptors(image.image_id, features)
+                    if on_features is not None:
+                        on_features(PhotoFeatures(image.name, image.image_id, keypoints, descriptors))
                     done += 1
                     progress("features", done, len(names))
 

@@ -125,10 +125,17 @@ def threads(number: int | None = None) -> Iterator[ThreadPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
+def num_cores() -> int:
+    """Return how many cores this process may use, which may be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def threads_in_memory(bytes_of_photo: float) -> int:
     """Return how many photos are worked on at a time: one on each core, if half of the free memory holds them."""
     at_a_time = 0.5 * available_host_bytes() / bytes_of_photo
-    return max(1, int(min(os.cpu_count() or 1, at_a_time)))
+    return max(1, int(min(num_cores(), at_a_time)))
 
 
 def _read_photo(folder: Path, name: str) -> Photo:

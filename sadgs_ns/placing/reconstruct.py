@@ -6,12 +6,10 @@ Each stage goes on where an interrupted run left it. Only the process of `colmap
 from __future__ import annotations
 
 import contextlib
-import io
 import itertools
-import json
 import math
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -30,12 +28,15 @@ from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
 from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
 from sadgs_ns.placing.judgement import judge, measure
+from sadgs_ns.placing.matching_ahead import AlikePartners, MatchingAhead, Partners, PlannedPartners
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
-from sadgs_ns.placing.undistortion import undistort
+from sadgs_ns.placing.scene_files import hold_out_panoramas, write_transforms
+from sadgs_ns.placing.undistortion import Undistortion
 
 if TYPE_CHECKING:
+    import numpy as np
     import torch
 
 SEED = 0  # Seed of COLMAP's random samples, so that equal photos give nearly equal cameras; its own is the clock
@@ -85,30 +86,37 @@ def make_model(
     names = sorted(itertools.chain(*groups, *rigs))
     database = model.with_name("database.db")
     gpu, nerfstudio = begin_imports()
-    if not model.exists():
-        with span("features"):
-            extract(photos, groups, database, rigs)
-        match(names, database, matching, gpu.result(), rigs)
-        with span("placing"):
-            place_cameras(photos, names, database, model, base, alike)
     known = set() if base is None else registered_photos(pycolmap.Reconstruction(base))
-    made = pycolmap.Reconstruction(model)
-    undistorted = model.with_name("undistorted")
-    with span("undistortion"):
-        undistort(photos, model, made, max_size, known)
-    check_written(undistorted / "sparse" / "0", made)
-    # nerfstudio prints all cameras where there are several.
-    with span("transforms.json"), contextlib.redirect_stdout(io.StringIO()):
-        nerfstudio.result().colmap_to_json(undistorted / "sparse" / "0", undistorted)
-    if rigs:
-        hold_out_panoramas(undistorted / "transforms.json", rigs)
+    with Undistortion(photos, model, max_size, known) as undistortion:
+        if model.exists():
+            undistortion.begin(pycolmap.Reconstruction(model))
+        else:
+            with MatchingAhead(gpu, partners_of(names, rigs, matching)) as ahead:
+                with span("features"):
+                    extract(photos, groups, database, rigs, ahead.add)
+                match(names, database, matching, gpu.result(), rigs, ahead=ahead)
+            with span("placing"):
+                place_cameras(photos, names, database, model, base, alike, on_adjusted=undistortion.begin)
+        made = pycolmap.Reconstruction(model)
+        with span("scene's files"):
+            without_lens = undistortion.write_model(made)
+            check_written(undistortion.folder / "sparse" / "0", made)
+            write_transforms(without_lens, undistortion.folder, nerfstudio.result().colmap_to_json)
+            if rigs:
+                hold_out_panoramas(undistortion.folder / "transforms.json", rigs)
+            summary = summarize_model(names, made, model, matching)
+        undistortion.wait()
+    return summary
+
+
+def summarize_model(names: Sequence[str], made: pycolmap.Reconstruction, model: Path, matching: Matching) -> Summary:
+    """Return the summary of the model in a folder, of which its attempts and their disagreement are read."""
     attempts = (model / "attempts.txt").read_text()
     disagreement_file = model / _DISAGREEMENT
     moved = math.nan
     if disagreement_file.exists():  # A run of an earlier version, which is resumed, has none.
         moved = float(disagreement_file.read_text())
-    with span("summary"):
-        return summarize(names, made, database, matching, attempts, moved)
+    return summarize(names, made, model.with_name("database.db"), matching, attempts, moved)
 
 
 @cache
@@ -138,20 +146,6 @@ def wake_gpu() -> torch.device | None:
     return device
 
 
-def hold_out_panoramas(file: Path, rigs: Sequence[Sequence[str]]) -> None:
-    """Hold out every tenth panorama whole, or photo, from the fifth; of fewer nerfstudio chooses single views."""
-    described = json.loads(file.read_text())
-    first = {view: views[0] for views in rigs for view in views}
-    names = in_order([frame["file_path"] for frame in described["frames"]])
-    whole = {name: first.get(name.removeprefix("images/"), name) for name in names}
-    chosen = list(dict.fromkeys(whole.values()))[4::10]
-    held_out = [name for name in names if whole[name] in chosen]
-    if held_out:
-        described["train_filenames"] = [name for name in names if whole[name] not in chosen]
-        described |= {"val_filenames": held_out, "test_filenames": held_out}
-        file.write_text(json.dumps(described, indent=4))
-
-
 def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> list[tuple[str, str]]:
     """Pair all photos, or with "sequential" each with some that follow it.
 
@@ -171,6 +165,13 @@ def choose_pairs(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: 
     return pairs
 
 
+def partners_of(names: Sequence[str], rigs: Sequence[Sequence[str]], matching: Matching) -> Partners:
+    """Return what finds the photos that each is matched with while features of others are still being found."""
+    if matching == "similar":
+        return AlikePartners(rigs)
+    return PlannedPartners(choose_pairs(names, rigs, matching))
+
+
 def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str, str]]:
     """Pair each frame with the next `overlap` ones, and with ever fewer of the later ones, which close loops."""
     steps = sorted({*range(1, overlap + 1), *(2**k for k in range(4, 10))})
@@ -179,11 +180,12 @@ def sequential_pairs(names: Sequence[str], overlap: int = 10) -> list[tuple[str,
 
 def match(
     names: Sequence[str], database: Path, matching: Matching, gpu: torch.device | None,
-    rigs: Sequence[Sequence[str]] = (), seed: int = SEED,
+    rigs: Sequence[Sequence[str]] = (), seed: int = SEED, ahead: MatchingAhead | None = None,
 ) -> None:  # fmt: skip
     """Match the features in COLMAP's database between photos; pairs that an earlier run matched are skipped.
 
-    A GPU compares the features and COLMAP verifies the matches; without one COLMAP does both, by lists in `pairs.txt`.
+    A GPU compares the features while threads verify the matches; without one COLMAP does both, by lists in `pairs.txt`.
+    The result is the same with matches that were found `ahead`.
     """
     from sadgs_ns.placing.matching import similar_photos, write_matches  # It imports torch; `wake_gpu` did.
 
@@ -191,18 +193,24 @@ def match(
     pair_list = database.with_name("pairs.txt")
     verification = verification_options(seed)
     progress(stage, 0, 1)
+    matched: dict[tuple[int, int], np.ndarray] = {}
+    on_device: Mapping[int, torch.Tensor] = {}
+    largest: Mapping[int, torch.Tensor] = {}
+    if ahead is not None:
+        ahead.stop()
+        matched = ahead.matches
+        on_device = ahead.descriptors
+        largest = ahead.largest
     with span("choice of pairs"):
         if matching == "similar":
             panorama = {view: views[0] for views in rigs for view in views}
-            pairs = [(a, b) for a, b in similar_photos(database, gpu) if panorama.get(a, a) != panorama.get(b, b)]
+            alike = similar_photos(database, gpu, largest)
+            pairs = [(a, b) for a, b in alike if panorama.get(a, a) != panorama.get(b, b)]
         else:
             pairs = choose_pairs(names, rigs, matching)
     if gpu is not None:
         with span("matches"):
-            write_matches(database, pairs, gpu, stage)
-        # It verifies pairs that failed again each time, so all are verified in one call.
-        with span("verification"):
-            pycolmap.geometric_verification(database, two_view_geometry_options=verification)
+            write_matches(database, pairs, gpu, stage, verification, matched, on_device)
     else:
         with span("matches"):
             rename_images(database, LISTED)  # In a list of pairs COLMAP takes # for a comment, and spaces to end names.
@@ -227,13 +235,15 @@ def verification_options(seed: int) -> pycolmap.TwoViewGeometryOptions:
 def place_cameras(
     photos: Path, names: Sequence[str], database: Path, model: Path, base: Path | None,
     alike: Sequence[Sequence[str]] = (), seed: int = SEED,
+    on_adjusted: Callable[[pycolmap.Reconstruction], None] | None = None,
 ) -> None:  # fmt: skip
     """Estimate cameras and points, and write the best model; its folder appears when it is complete.
 
     Photos are added to an earlier model: its poses and intrinsics stay as they are, points are triangulated with the
     new photos, and photos that did not register before are tried again. Cameras of photos that are `alike`, as of
     `make_model`, are joined if they are one and the model suffices. A new model that few points hold together is made
-    again with other samples, as of `most_agreed`. Raise InputError if no photos could be related.
+    again with other samples, as of `most_agreed`. `on_adjusted` is called with the model when only its colours are
+    missing. Raise InputError if no photos could be related.
     """
     search = _Search.of(photos, names, database, model, base, seed)
     limits: Mapping[str, float] = {}
@@ -272,10 +282,13 @@ def place_cameras(
     for frame_id in search.held_frames:  # COLMAP rounds poses that it holds fixed.
         assert before is not None
         best.frames[frame_id].rig_from_world = before.frames[frame_id].rig_from_world
-    best.extract_colors_for_all_images(photos)  # Otherwise a point has one photo's colour, or none.
+    if on_adjusted is not None:
+        on_adjusted(best)
     partial = empty_folder(model.with_name("model.partial"))
-    best.write(partial)
-    check_written(partial, best)
+    with span("colours and model"):
+        best.extract_colors_for_all_images(photos)  # Otherwise a point has one photo's colour, or none.
+        best.write(partial)
+        check_written(partial, best)
     (partial / "attempts.txt").write_text(attempts)
     (partial / _DISAGREEMENT).write_text(str(moved))
     if joined:  # Photos that are added later find their folder's camera in the database.

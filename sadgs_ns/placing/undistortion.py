@@ -9,11 +9,13 @@ COLMAP's.
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import functools
 import shutil
 import threading
 from collections.abc import Callable, Collection
-from concurrent.futures import as_completed
+from concurrent.futures import Future, as_completed
 from pathlib import Path
 
 import cv2
@@ -22,7 +24,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from sadgs_ns.events import progress
+from sadgs_ns.events import progress, span
 from sadgs_ns.placing.photos import threads, threads_in_memory
 
 MOST_SIDE = 32_766  # Longest side in px that OpenCV warps
@@ -34,56 +36,87 @@ Warp = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 """Takes a photo [H, W, 3] and returns its undistorted image [H', W', 3]."""
 
 
-def undistort(photos: Path, model: Path, made: pycolmap.Reconstruction, max_size: int, known: Collection[str]) -> None:
-    """Write `images`, `alpha`, `masks` and their model, `sparse/0`, to the folder `undistorted`, which is made anew.
+class Undistortion:
+    """A context in which threads write the undistorted images of a model while its files are written.
 
-    Raise OSError if a file cannot be written.
-
-    Args:
-        photos: The photos' folder.
-        model: The model's folder; beside it lie `write_alpha`'s and `write_masks`' files.
-        made: The model in that folder.
-        max_size: Longest side of the images in px; 0 keeps them as they are.
-        known: Names of photos that were undistorted before.
+    They lie in `images`, `alpha` and `masks` of the folder `undistorted`, and their model in its `sparse/0`. Call
+    `begin`, `write_model` and `wait` in this order. Leaving the context early drops the images that are not begun.
     """
-    folder = model.with_name("undistorted")
-    shutil.rmtree(folder, ignore_errors=True)
-    registered = [image for image in made.images.values() if image.has_pose and image.name not in known]
-    registered.sort(key=lambda image: image.camera_id)  # The photos of a camera share its warp.
-    options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
-    cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
-    one_at_a_time = threading.Lock()
 
-    # A warp takes 8 bytes a pixel, and each photo may have a camera of its own.
-    @functools.lru_cache(maxsize=2)
-    def warp_of_camera(camera_id: int) -> Warp | None:
-        return warp_of(cameras[camera_id], options)
+    def __init__(self, photos: Path, model: Path, max_size: int, known: Collection[str]) -> None:
+        """Take the options.
 
-    def write(name: str, camera_id: int) -> None:
-        target = folder / "images" / name
+        Args:
+            photos: The photos' folder.
+            model: The model's folder; beside it lie `write_alpha`'s and `write_masks`' files, and `undistorted`.
+            max_size: Longest side of the images in px; 0 keeps them as they are.
+            known: Names of photos that were undistorted before.
+        """
+        self.folder = model.with_name("undistorted")
+        self._photos = photos
+        self._model = model
+        self._known = known
+        self._options = pycolmap.UndistortCameraOptions(max_image_size=max_size or -1)
+        self._pool = contextlib.ExitStack()
+        self._work: list[Future[None]] = []
+        self._cameras: dict[int, pycolmap.Camera] = {}
+        self._one_at_a_time = threading.Lock()
+        # A warp takes 8 bytes a pixel, and each photo may have a camera of its own.
+        self._warp_of_camera = functools.lru_cache(maxsize=2)(self._make_warp)
+
+    def __enter__(self) -> Undistortion:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.close()
+
+    def begin(self, made: pycolmap.Reconstruction) -> None:
+        """Make the folder anew, and begin to write the images of a model; its colours may still change."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        registered = [image for image in made.images.values() if image.has_pose and image.name not in self._known]
+        registered.sort(key=lambda image: image.camera_id)  # The photos of a camera share its warp.
+        self._cameras = {image.camera_id: copy.copy(made.cameras[image.camera_id]) for image in registered}
+        cv2.setNumThreads(1)  # Each thread of ours has a photo.
+        pool = self._pool.enter_context(threads(_num_threads(self._cameras.values())))
+        self._work = [pool.submit(self._write, image.name, image.camera_id) for image in registered]
+
+    def write_model(self, made: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+        """Write the model of the images, given that of the photos, and return it."""
+        cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
+        undistorted = {key: pycolmap.undistort_camera(self._options, camera) for key, camera in cameras.items()}
+        sparse = self.folder / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        model = without_distortion(made, undistorted)
+        model.write(sparse)
+        return model
+
+    def wait(self) -> None:
+        """Wait until all images are written. Raise OSError if one cannot be."""
+        progress("undistorted photos", 0, len(self._work))
+        with span("rest of undistortion"):
+            for done, finished in enumerate(as_completed(self._work), 1):
+                finished.result()
+                progress("undistorted photos", done, len(self._work))
+
+    def _make_warp(self, camera_id: int) -> Warp | None:
+        return warp_of(self._cameras[camera_id], self._options)
+
+    def _write(self, name: str, camera_id: int) -> None:
+        """Write the image of a photo, and its opacity and mask if it has them."""
+        target = self.folder / "images" / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        with one_at_a_time:
-            warp = warp_of_camera(camera_id)
+        camera = self._cameras[camera_id]
+        with self._one_at_a_time:
+            warp = self._warp_of_camera(camera_id)
         if warp is None:
-            write_as_colmap(photos / name, cameras[camera_id], options, target)
+            write_as_colmap(self._photos / name, camera, self._options, target)
         else:
-            write_image(warp(read_pixels(photos / name)), target)
+            write_image(warp(read_pixels(self._photos / name)), target)
         for kind in ("alpha", "masks"):
-            stored = model.with_name(kind) / f"{name}.png"
+            stored = self._model.with_name(kind) / f"{name}.png"
             if stored.exists():
-                write_grey(stored, cameras[camera_id], options, folder / kind / f"{name}.png", is_mask=kind == "masks")
-
-    progress("undistorted photos", 0, len(registered))
-    cv2.setNumThreads(1)  # Each thread of ours has a photo.
-    with threads(_num_threads(cameras.values())) as pool:
-        work = [pool.submit(write, image.name, image.camera_id) for image in registered]
-        for done, finished in enumerate(as_completed(work), 1):
-            finished.result()
-            progress("undistorted photos", done, len(registered))
-    sparse = folder / "sparse" / "0"
-    sparse.mkdir(parents=True)
-    undistorted = {key: pycolmap.undistort_camera(options, camera) for key, camera in cameras.items()}
-    without_distortion(made, undistorted).write(sparse)
+                grey = self.folder / kind / f"{name}.png"
+                write_grey(stored, camera, self._options, grey, is_mask=kind == "masks")
 
 
 def warp_of(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> Warp | None:

@@ -47,9 +47,9 @@ PAIR_BYTES = 4
 PIXEL_BYTES = 54
 """Bytes of a pixel in the backward pass of rasterization: the rendered colours 12 and those on the background 12,
 alphas 4, last Gaussians 4, gradient of the colours 12 and of alphas 4, image in bytes 3, quantized S̄ 3."""
-LOSS_PIXEL_BYTES = 162
+LOSS_PIXEL_BYTES = 114
 """Bytes of a pixel in the loss, with our kernels: rendered colours 12, on the background 12 + 16, alphas 4, last
-Gaussians 4, image 12, five blurred maps 60, three slopes 36, image in bytes 3, quantized S̄ 3."""
+Gaussians 4, image 12, three slopes 36, gradient 12, image in bytes 3, quantized S̄ 3."""
 TORCH_LOSS_PIXEL_BYTES = 300
 """The same without our kernels, where torch keeps about twenty maps for the loss; measured, not counted."""
 PAIRS_PER_GAUSSIAN = 12

@@ -110,20 +110,16 @@ def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     assert "| × 2 | .00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
-def test_approximations_are_printed_as_their_command_does(tmp_path: Path):
-    common = {"table": "footprint", "input": "demo", "median": 0.1, "p95": 0.2, "max": 0.3, "flips": 0.0, "ms": 1234.5}
-    rows = [{**common, "variant": "1 sample"}, {**common, "variant": "4 samples", "ms": None}]
-    tables = {
-        "eta": {"kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo"},
-        "one": {
-            "kind": "approximations", "rows": "a.jsonl", "of": "footprint", "input": "demo", "variants": ["1 sample"]
-        },
-    }  # fmt: skip
-    folder = checkout(tmp_path, tables, {"a.jsonl": rows})
+def test_kernels_and_starts_are_tables_of_their_rows(tmp_path: Path):
+    ok = {"scene": "fox", "status": "ok"}
+    kernel = {**ok, "label": "adam", "by": "torch", "ratio": 1.25, "launches": 40.0}
+    start = {**ok, "label": "sadgs", "first": True, "wait": 9.0, "seconds": 20.0}
+    tables = {"kernels": {"kind": "kernels", "rows": "k.jsonl"}, "start": {"kind": "startup", "rows": "s.jsonl"}}
+    folder = checkout(tmp_path, tables, {"k.jsonl": [kernel], "s.jsonl": [start]})
     assert bench.main(["documents", str(folder)]) == 0
     text = (folder / "README.md").read_text("utf8")
-    assert text.count("| 1 sample | 10 % | 20 % | 30 % | 0 % | 1,234 |") == 2
-    assert text.count("| 4 samples | 10 % | 20 % | 30 % | 0 % | – |") == 1
+    assert "| adam | torch | 1.250 | 40 |" in text
+    assert "| sadgs | 9.0 | 20.0 | – | – |" in text
 
 
 def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tmp_path: Path):

@@ -12,11 +12,13 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.blender_dataparser import Blender, BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.data.utils import colmap_parsing_utils
 from PIL import Image
 
 from helpers.short_runs import blender_data, nerfstudio_data
-from sadgs_ns.data.own_parsers import BlenderParser
+from sadgs_ns.data.own_parsers import BlenderParser, ColmapParser
 from sadgs_ns.data.transforms_parser import TransformsParser
 
 # nerfstudio opens an image, to look for smaller copies of it, and leaves it open.
@@ -147,3 +149,21 @@ def test_a_file_that_was_not_checked_is_refused_as_by_nerfstudio(
         TransformsParser(config).get_dataparser_outputs(split)
     with pytest.raises((error, AssertionError), match=sentence):
         Nerfstudio(config).get_dataparser_outputs(split)
+
+
+def test_the_poses_of_a_colmap_model_are_read_once_for_all_splits(
+    colmap: ColmapDataParserConfig, monkeypatch: pytest.MonkeyPatch
+):
+    read = colmap_parsing_utils.read_images_binary
+    files: list[Path] = []
+
+    def counted(file: Path) -> Any:
+        files.append(file)
+        return read(file)
+
+    monkeypatch.setattr(colmap_parsing_utils, "read_images_binary", counted)
+    colmap.load_3D_points = False
+    parser = ColmapParser(colmap)
+    for split in ("train", "val"):
+        expect_the_same(parser.get_dataparser_outputs(split), ColmapParser(colmap).get_dataparser_outputs(split))
+    assert len(files) == 1 + 2

@@ -38,14 +38,15 @@ def stub_gsplat(monkeypatch: pytest.MonkeyPatch, per_axis_radii: bool) -> None:
 
     def isect_tiles(
         means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, tile_width: int, tile_height: int
-    ) -> tuple[Any, Any, Tensor]:
+    ) -> tuple[Tensor, Any, Tensor]:
         assert tile_size == backend_torch.TILE_SIZE
         assert radii.dtype == torch.int32
         extents = (radii if per_axis_radii else radii[..., None].expand_as(means2d)).to(means2d.dtype)
         tiles = backend_torch._bin_into_tiles(
             means2d, depths, extents, tile_width * tile_size, tile_height * tile_size
         )  # fmt: skip
-        return None, tiles, tiles.flatten_ids.int()
+        counts = torch.bincount(tiles.flatten_ids, minlength=depths.numel()).view_as(depths)
+        return counts.int(), tiles, tiles.flatten_ids.int()
 
     def isect_offset_encode(keys: Any, num_views: int, tile_width: int, tile_height: int) -> Tensor:
         return keys.offsets.int().view(num_views, tile_height, tile_width)

@@ -36,7 +36,7 @@ def use_our_rasterizer(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have runs draw with it."""
     monkeypatch.setattr(rasterization, "use_triton", lambda place: True)
     monkeypatch.setattr(compositing, "rasterize_to_pixels", composite)
-    lanes = [(tiles, "_LANES"), (harmonics, "_LANES"), (harmonics, "_BACKWARD_LANES")]
+    lanes = [(tiles, "_LANES"), (harmonics, "_LANES")]
     lanes += [(projection, "_LANES"), (projection_forward, "_LANES")]
     for module, name in lanes:
         monkeypatch.setattr(module, name, 1024)  # The interpreter runs one program after the other.

@@ -57,7 +57,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[
 
 
 @pytest.mark.hard_case("pixels where both images agree", "L1 has a kink there; its gradient is 0, as torch's")
-@pytest.mark.parametrize("shape", [(2, 21, 47, 3), (1, 11, 11, 3), (1, 20, 60, 3)], ids=str)
+@pytest.mark.parametrize("shape", [(2, 21, 47, 3), (1, 11, 11, 3), (1, 20, 60, 3), (1, 40, 13, 3)], ids=str)
 def test_loss_and_gradient_equal_the_float64_reference(shape):
     generator = torch.Generator().manual_seed(0)
     target = torch.rand(shape, generator=generator)
@@ -79,6 +79,30 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     torch.testing.assert_close(fast[0], reference[0], atol=2e-6, rtol=0)
     torch.testing.assert_close(fast[1], reference[1], atol=1e-5, rtol=0)
     torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
+
+
+def test_the_loss_does_not_depend_on_how_many_rows_a_program_handles(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    target = torch.rand((1, 35, 12, 3), generator=generator).to(DEVICE)
+    results = []
+    for programs in (1, 1000):  # One of 35 rows, and three of at most 16
+        monkeypatch.setattr(photometric, "_PROGRAMS", programs)
+        x = (0.9 * target).requires_grad_()
+        loss, psnr = fused_photometric_loss(x, target, ssim_lambda=0.3, l2_lambda=1.5)
+        loss.backward()
+        results.append([loss.detach(), psnr, x.grad])
+    for of_one, of_three in zip(*results, strict=True):
+        torch.testing.assert_close(of_one, of_three, atol=1e-6 * float(of_three.abs().max()), rtol=0)
+
+
+@pytest.mark.parametrize("size", [(1, 11, 33), (4, 532, 2397), (1, 1060, 4800), (2, 3000, 12000)], ids=str)
+def test_programs_of_the_loss_cover_the_images_and_run_at_the_same_time(size):
+    views, height, row = size
+    (columns, strips, of_views), rows = photometric._strips(*size)
+    assert columns * photometric._COLUMNS >= row
+    assert strips * rows >= height
+    assert of_views == views
+    assert columns * strips * views <= photometric._PROGRAMS
 
 
 def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
@@ -130,20 +154,19 @@ def test_psnr_of_extreme_errors_is_torchs(value):
 
 
 def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
-    """There are as many as two views of 1920×1080 px leave, which is no multiple of what is added at once."""
+    """Their numbers are no multiple of what is added at once, and several times as many."""
     generator = torch.Generator().manual_seed(0)
-    differences = torch.rand((2, 12150), generator=generator)
-    similarities = torch.rand(12240, generator=generator)
+    sums = torch.rand((3, 12150), generator=generator)  # SSIM, and absolute and squared differences
     parts = torch.rand(5000, generator=generator) / 5e6
     loss = torch.zeros((), device=DEVICE)
     psnr = torch.zeros((), device=DEVICE)
     n = 12150 * 1024
     weights = 0.8 / n, 0.2 / n, 2.0 / n
     photometric._finish[1,](
-        differences.to(DEVICE), similarities.to(DEVICE), parts.to(DEVICE), loss, psnr,
-        n, 12150, 12240, 5000, 0.2, *weights, photometric._LANES,
+        sums.to(DEVICE), parts.to(DEVICE), loss, psnr,
+        n, 12150, 5000, 0.2, *weights, photometric._LANES,
     )  # fmt: skip
-    l1, l2, of_ssim, more = (float(values.double().sum()) for values in (*differences, similarities, parts))
+    of_ssim, l1, l2, more = (float(values.double().sum()) for values in (*sums, parts))
     expected = weights[0] * l1 + 0.2 - weights[1] * of_ssim + weights[2] * l2 + more
     assert float(loss) == pytest.approx(expected, abs=3e-8)
     assert float(psnr) == pytest.approx(-10 * math.log10(l2 / n), rel=1e-6)

@@ -18,16 +18,16 @@ from triton.compiler import ASTSource
 import sadgs_ns.kernels as package
 
 CONSTANTS = {
-    "GAUSSIAN": (0.25, 0.5, 0.25), "STRIP": 256, "RUN": 8, "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
-    "VIEWS": 2, "BLOCK": 1024, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
+    "GAUSSIAN": (0.25, 0.5, 0.25), "ROWS": 16, "COLUMNS": 128, "TILE": 8, "LANES": 32,
+    "BLOCK": 1024, "BLUR": 0.3, "MARGIN": 0.3, "EPSILON": 1e-5,
     "VERTICAL": False, "MAX": 1e18, "PIXELS": 1024, "HIGHEST": 4.0, "FAR": 1e10,
     "OCTAVES": 12.0, "INVALID": 255, "WIDTHS": (3, 45, 1), "PER_GAUSSIAN": 2, "GAUSSIANS": 16, "STRIDE": 12,
     "ALPHAS": True, "ABSGRAD": True, "PRECISION": "tf32x3", "PENALTY": True, "LEARNED": True, "CULL": True,
     "DEPTHS": True, "PASSED": True, "POSES": True, "FLAGS": 1, "FEW": 64,
     "PART": 256,
 }
-INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride start".split()
-INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_strips num_tiles".split()
+INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_height used stride".split()
+INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_programs num_tiles".split()
 INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 log_beta1 log_beta2 eps l1_weight ssim_weight l2_weight".split()
 FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top near_plane".split()
@@ -64,7 +64,7 @@ for module in pkgutil.iter_modules(package.__path__):
             else:
                 signature[parameter.name] = POINTERS.get(parameter.name, "*fp32")
         others = dict.fromkeys(["_list", "_list_parts", "_order"], {"tiles": "*i32"})
-        others |= dict.fromkeys(["_blur_along_rows", "_gradient"], {"y": "*u8"})
+        others |= dict.fromkeys(["_similarity", "_gradient"], {"y": "*u8"})
         signatures = [signature, *([signature | others[name]] if name in others else [])]
         for signature in signatures:
             for capability in (80, 90):  # A100, H200
@@ -77,7 +77,7 @@ print(" ".join(compiled))
 def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     run = run_with_the_compiler(tmp_path, COMPILE)
     assert run.returncode == 0, run.stderr[-3000:]
-    expected = {"_blur_along_rows", "_similarity", "_spread_along_rows", "_gradient", "_count", "_list", "_observe"}
+    expected = {"_similarity", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
     expected |= {"_composite_backward", "_composite_forward", "_quantize", "_accumulate_gradients", "_finish", "_order"}
     expected |= {

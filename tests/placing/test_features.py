@@ -101,7 +101,7 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
 def test_no_more_photos_are_searched_at_a_time_than_memory_holds(features, monkeypatch):
     from sadgs_ns.placing import photos
 
-    monkeypatch.setattr(photos.os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(photos, "num_cores", lambda: 64)
     monkeypatch.setattr(photos, "available_host_bytes", lambda: 16e9)
     assert features._num_threads([(2000, 1500)]) == 11  # half of the memory, at 720 MB each
     assert features._num_threads([(20_000, 15_000)]) == 4  # these are scaled down to 3200 px

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
+import shutil
+import sqlite3
 from pathlib import Path
 from types import ModuleType
 
@@ -100,6 +104,20 @@ def parts_of_a_wall(folder: Path) -> list[str]:
     return names
 
 
+def verification_options():
+    import pycolmap
+
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = 0
+    return options
+
+
+def rows_of(database: Path, table: str) -> list[tuple]:
+    """All that a table of COLMAP's database holds, byte by byte."""
+    with contextlib.closing(sqlite3.connect(database)) as opened:
+        return opened.execute(f"SELECT * FROM {table} ORDER BY pair_id").fetchall()
+
+
 def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp_path: Path):
     import pycolmap
 
@@ -112,9 +130,8 @@ def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp
         features.extract(tmp_path / "photos", [names], database)
         pairs = [(names[0], names[1]), (names[0], names[2]), (names[1], names[2])]
         if ours:
-            matching.write_matches(database, pairs, torch.device("cpu"), "matches")
-            matching.write_matches(database, pairs, torch.device("cpu"), "matches")  # There is nothing left to do.
-            pycolmap.geometric_verification(database)  # It takes names with spaces, as a list of pairs does not.
+            # It takes names with spaces, as a list of pairs does not.
+            matching.write_matches(database, pairs, torch.device("cpu"), "matches", verification_options())
         else:
             pycolmap.match_exhaustive(database)
         with pycolmap.Database.open(database) as opened:
@@ -122,9 +139,98 @@ def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp
             matches = opened.read_matches(ids[names[0]], ids[names[1]])
             one, other = (torch.from_numpy(opened.read_descriptors(ids[name]).data.copy()) for name in names[:2])
             same = {*map(tuple, matches.tolist())} == {*map(tuple, matching.match_descriptors(one, other).tolist())}
-            assert same or not ours, "COLMAP should verify what was matched, and match nothing itself"
+            assert same or not ours
             geometries = [opened.read_two_view_geometry(ids[a], ids[b]) for a, b in pairs]
         inliers.append([len(geometry.inlier_matches) for geometry in geometries])
     colmaps, our = inliers
     assert min(colmaps) > 50
     assert our == pytest.approx(colmaps, rel=0.1)
+
+
+@pytest.fixture(scope="module")
+def searched(matching: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str, str]]]:
+    """A database with the features of three parts of a wall, and of two photos without relation, and pairs of them.
+
+    Some pairs are not in the order of their numbers in the database. One photo has no features at all.
+    """
+    from sadgs_ns.placing import features
+
+    folder = tmp_path_factory.mktemp("searched")
+    names = parts_of_a_wall(folder / "photos")
+    noise = gaussian_filter(np.random.default_rng(1).normal(size=(320, 460)), 2.5)
+    Image.fromarray((127 + 60 * noise / noise.std()).clip(0, 255).astype(np.uint8)).save(folder / "photos/noise.png")
+    Image.new("L", (460, 320)).save(folder / "photos/black.png")
+    names += ["noise.png", "black.png"]
+    features.extract(folder / "photos", [names], folder / "database.db")
+    pairs = list(itertools.combinations(reversed(names), 2))
+    return folder / "database.db", pairs
+
+
+@pytest.mark.parametrize("has_focal_length", [False, True])
+def test_matches_are_verified_as_by_colmap_bit_for_bit(
+    matching: ModuleType, searched, tmp_path: Path, has_focal_length: bool
+):
+    import pycolmap
+
+    database, pairs = searched
+    shutil.copyfile(database, tmp_path / "ours.db")
+    with pycolmap.Database.open(tmp_path / "ours.db") as opened:
+        for camera in opened.read_all_cameras():
+            camera.has_prior_focal_length = has_focal_length  # Then it looks for an essential matrix.
+            opened.update_camera(camera)
+    matching.write_matches(tmp_path / "ours.db", pairs, torch.device("cpu"), "matches", verification_options())
+    shutil.copyfile(tmp_path / "ours.db", tmp_path / "colmap.db")
+    with pycolmap.Database.open(tmp_path / "colmap.db") as opened:
+        opened.clear_two_view_geometries()
+    pycolmap.geometric_verification(tmp_path / "colmap.db", two_view_geometry_options=verification_options())
+    ours = rows_of(tmp_path / "ours.db", "two_view_geometries")
+    has_matches = {pair_id: rows > 0 for pair_id, rows, *_ in rows_of(tmp_path / "ours.db", "matches")}
+    of_matched = [row for row in ours if has_matches[row[0]]]  # COLMAP writes nothing of pairs without any.
+    assert of_matched == rows_of(tmp_path / "colmap.db", "two_view_geometries")
+    assert sum(rows > 0 for _, rows, *_ in ours) == 3
+    assert len(ours) == len(pairs) == 10, "those that failed have a row, too"
+
+
+def test_pairs_that_were_interrupted_end_as_if_they_were_not(matching: ModuleType, searched, tmp_path, monkeypatch):
+    database, pairs = searched
+    for name in ("whole.db", "parts.db"):
+        shutil.copyfile(database, tmp_path / name)
+    arguments = (pairs, torch.device("cpu"), "matches", verification_options())
+    matching.write_matches(tmp_path / "whole.db", *arguments)
+    monkeypatch.setattr(matching, "_SAVED_AT_ONCE", 3)
+    matched = []
+    match = matching.match_descriptors
+
+    def interrupted(one, other):
+        matched.append(1)
+        if len(matched) == 8:
+            raise KeyboardInterrupt
+        return match(one, other)
+
+    monkeypatch.setattr(matching, "match_descriptors", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        matching.write_matches(tmp_path / "parts.db", *arguments)
+    saved = rows_of(tmp_path / "parts.db", "two_view_geometries")
+    assert len(saved) == len(rows_of(tmp_path / "parts.db", "matches")) == 3
+    matching.write_matches(tmp_path / "parts.db", *arguments)
+    assert len(matched) == 8 + 7, "those that were saved are not matched again"
+    matching.write_matches(tmp_path / "parts.db", *arguments)
+    assert len(matched) == 8 + 7, "neither are pairs that failed"
+    for table in ("matches", "two_view_geometries"):
+        assert rows_of(tmp_path / "parts.db", table) == rows_of(tmp_path / "whole.db", table)
+
+
+def test_stored_matches_are_verified_again_without_geometries(matching: ModuleType, searched, tmp_path, monkeypatch):
+    """As those of a run of an earlier version, or of another seed."""
+    import pycolmap
+
+    database, pairs = searched
+    shutil.copyfile(database, tmp_path / "database.db")
+    arguments = (pairs, torch.device("cpu"), "matches", verification_options())
+    matching.write_matches(tmp_path / "database.db", *arguments)
+    before = rows_of(tmp_path / "database.db", "two_view_geometries")
+    with pycolmap.Database.open(tmp_path / "database.db") as opened:
+        opened.clear_two_view_geometries()
+    monkeypatch.setattr(matching, "match_descriptors", None)
+    matching.write_matches(tmp_path / "database.db", *arguments)
+    assert rows_of(tmp_path / "database.db", "two_view_geometries") == before

@@ -1413,17 +1413,24 @@ def test_features_are_found_while_torch_is_imported():
     assert "torch" not in imported_by("from sadgs_ns.placing import reconstruct")
 
 
-def test_a_gpu_matches_the_pairs_that_colmap_verifies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_gpu_s_matches_are_verified_with_the_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The device is the CPU here, which goes the GPU's way."""
     calls: list[tuple] = []
-    monkeypatch.setattr(
-        "sadgs_ns.placing.matching.write_matches",
-        lambda database, pairs, device, stage: calls.append((*pairs, device)),
-    )
-    monkeypatch.setattr(pycolmap, "geometric_verification", lambda database, **options: calls.append(("verified",)))
+
+    def noting(
+        database: Path,
+        pairs: list[tuple[str, str]],
+        device: torch.device,
+        stage: str,
+        options: pycolmap.TwoViewGeometryOptions,
+        *ahead: Any,
+    ) -> None:
+        calls.append((*pairs, device, options.ransac.random_seed))
+
+    monkeypatch.setattr("sadgs_ns.placing.matching.write_matches", noting)
     device = torch.device("cpu")
-    match(["a 1.png", "a 2.png"], tmp_path / "db", "exhaustive", device)
-    assert calls == [(("a 1.png", "a 2.png"), device), ("verified",)]
+    match(["a 1.png", "a 2.png"], tmp_path / "db", "exhaustive", device, seed=5)
+    assert calls == [(("a 1.png", "a 2.png"), device, 5)]
 
 
 @pytest.mark.hard_case(

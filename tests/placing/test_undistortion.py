@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -91,7 +92,10 @@ def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Pa
         return warp_of(camera, options)
 
     monkeypatch.setattr(undistortion, "warp_of", counted)
-    undistortion.undistort(photos, tmp_path / "model", made, 0, {"5.png"})
+    with undistortion.Undistortion(photos, tmp_path / "model", 0, {"5.png"}) as images:
+        images.begin(made)
+        images.write_model(made)
+        images.wait()
     assert asked == [(90, 60), (60, 90)]
     model = pycolmap.Reconstruction(tmp_path / "undistorted" / "sparse" / "0")
     options = pycolmap.UndistortCameraOptions()
@@ -105,6 +109,49 @@ def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Pa
         warp = warp_of(camera, options)
         assert warp is not None
         np.testing.assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
+
+
+def model_of_photos(folder: Path, number: int) -> pycolmap.Reconstruction:
+    """Write equal photos, and return a model in which each has a pose."""
+    folder.mkdir()
+    made = pycolmap.Reconstruction()
+    camera = lens(-0.12, 90, 60)
+    made.add_camera_with_trivial_rig(camera)
+    for image_id in range(1, number + 1):
+        name = f"{image_id}.png"
+        Image.fromarray(photograph(camera, 0.1)).save(folder / name)
+        image = pycolmap.Image(name=name, camera_id=1, image_id=image_id)
+        made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    return made
+
+
+def test_a_photo_that_is_gone_is_named_when_the_model_is_written(tmp_path: Path):
+    made = model_of_photos(tmp_path / "photos", 3)
+    (tmp_path / "photos" / "2.png").unlink()
+    with undistortion.Undistortion(tmp_path / "photos", tmp_path / "model", 0, ()) as images:
+        images.begin(made)
+        images.write_model(made)
+        with pytest.raises(OSError, match=r"2\.png cannot be read any more"):
+            images.wait()
+
+
+def test_images_that_are_not_begun_are_dropped_where_the_files_fail(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    made = model_of_photos(tmp_path / "photos", 4)
+    goes_on = threading.Event()
+    read = read_pixels
+
+    def read_late(photo: Path) -> np.ndarray:
+        assert goes_on.wait(60)
+        return read(photo)
+
+    monkeypatch.setattr(undistortion, "read_pixels", read_late)
+    monkeypatch.setattr(undistortion, "threads_in_memory", lambda bytes_of_photo: 1)
+    images = undistortion.Undistortion(tmp_path / "photos", tmp_path / "model", 0, ())
+    with pytest.raises(OSError, match="full"), images:
+        images.begin(made)
+        threading.Timer(0.2, goes_on.set).start()
+        raise OSError("full")
+    assert len(list((tmp_path / "undistorted" / "images").glob("*.png"))) <= 1
 
 
 def test_keypoints_of_the_model_move_with_the_images():

@@ -55,13 +55,14 @@ RUN_BY = {
     "sadgs-export outputs/demo/sadgs/run/config.yml --output splat.ply --crop": "tests/cli/test_export.py::"
     "test_what_is_taken_away_is_told_and_not_in_the_file",
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
-    "python -m benchmarks approximations": "tests/benchmarks/test_approximations.py::"
-    "test_every_row_is_printed_and_written",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
     "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",
     "python -m benchmarks seconds": "tests/benchmarks/test_seconds.py::test_the_parts_of_a_command_are_measured_once",
+    "python -m benchmarks kernels": "tests/benchmarks/test_kernels.py::test_the_command_writes_a_row_for_each_kernel",
+    "python -m benchmarks startup": "tests/benchmarks/test_startup.py::"
+    "test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones",
     "python -m benchmarks documents": "tests/repository/test_docs.py::test_tables_are_what_their_rows_give",
 }
 """Tests that run commands which begin so, or files that do; the longest beginning counts."""

@@ -3,7 +3,7 @@
 The memory that the driver has left and that torch's allocator keeps unused must hold the new Gaussians (parameter,
 gradient, two moments, statistics), a copy of the widest parameter while it is rewritten, and the working memory of the
 next step, which is the largest of three phases: tile lists, loss, backward pass. `render/step_memory.py` counts it for
-the views, pixels and tile pairs of a step: 162 bytes for each pixel in the loss (300 without our kernels), and
+the views, pixels and tile pairs of a step: 114 bytes for each pixel in the loss (300 without our kernels), and
 altogether about 1.8 kB a Gaussian of degree 3 at one view a step, 2.3 kB at two and 3.5 kB at four, if each has 12
 pairs in a view. Fragmentation of the allocator's unused memory is not counted.
 
@@ -124,8 +124,8 @@ def test_each_phase_counts_what_it_grows_with():
 @pytest.mark.hard_case("several views a step", "the memory plan leaves room for fewer Gaussians")
 def test_several_views_leave_room_for_fewer_gaussians(card: Any):
     card(5, 6)
-    one = fit(views=1, pixels=4_600_000)[0]
-    four = fit(views=4, pixels=4 * 4_600_000)[0]
+    one = fit(views=1, pixels=6_500_000)[0]
+    four = fit(views=4, pixels=4 * 6_500_000)[0]
     assert one == int(4e9 // each(1))
     assert four < 0.5 * one
     assert fit(views=4)[0] == int(4e9 // each(4))
