@@ -16,6 +16,16 @@ STAMP := $(VENV)/.installed
 demo: $(STAMP)
 	$(BIN)/python -m examples.drawn_scene
 
+# The moving picture and the splat of docs/gallery.md, trained on the CPU.
+.PHONY: turn
+turn: $(STAMP)
+	$(BIN)/python -m examples.drawn_scene.scene turn-output/demo --width 320 --height 240 --views 64
+	CUDA_VISIBLE_DEVICES= $(BIN)/ns-train sadgs --data turn-output/demo --output-dir turn-output --timestamp run \
+	  --vis tensorboard --max-num-iterations 600 --pipeline.views-per-iteration 1 --pipeline.model.sh-degree 0 \
+	  --pipeline.model.strategy.max-gaussians 10000
+	$(BIN)/python -m examples.turn turn-output/demo/sadgs/run --output turn-output/turn.webp --shrink 3
+	$(BIN)/sadgs-export turn-output/demo/sadgs/run --output turn-output/room.ply --frame colmap
+
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
@@ -55,5 +65,5 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) demo-output turn-output gate-output outputs build site *.egg-info .pytest_cache .ruff_cache .hypothesis
 	find sadgs_ns benchmarks examples tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -32,12 +32,14 @@ COMMANDS = {
     "step": ("step:Command", "the parts of a training step, with and without our Triton kernels (CUDA)"),
     "kernels": ("kernel_share:Command", "what each Triton kernel brings: steps with its twin in its place (CUDA)"),
     "validation": ("validation:Command", "copies of scenes whose validation views are held out"),
+    "captures": ("captures:Command", "where the tables' captures come from, and whether a folder holds them"),
     "chain": ("chain:Command", "from photos to the exported file, compared with the original photos"),
     "cameras": ("cameras:Command", "how accurately cameras are placed, with several seeds and losses"),
     "seconds": ("seconds:Command", "what a user waits for: the parts of a command side by side"),
     "startup": ("startup:Command", "what the code for a quick start brings: the wait for the first step"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
+    "evidence": ("moved:Command", "pictures of what a run finds to have moved, and why"),
     "disturbed": ("disturbed:Command", "copies of scenes in which things stand before some photos, and their masks"),
 }
 """What is done besides running a protocol, and the class that does it."""

@@ -121,7 +121,8 @@ def run_row(job: Job, root: Path, work: Path) -> dict[str, Any]:
         them, `structure_tensor_seconds`, one after the other before the loop; `loop_seconds`, of the training loop
         alone. Over the held-out views what `evaluate.quality` measures, and of each `ply_view_psnr` (as other programs'
         viewers draw) and what `angles_of_views` tells. `differing_pixels` is what `viewpoints.pixels_that_differ`
-        tells. `curve`, if the job asks for it, has the points of `curve.Curve`, the last one being the finished run; no
+        tells. What `moved.measures` tells is there if the run found what moved. `curve`, if the job asks for it, has
+        the points of `curve.Curve`, the last one being the finished run; no
         time contains its evaluations.
         Where torchrun started several processes, which train one splat on `devices` of them, the first measures all
         but `curve`: its checkpoint is evaluated on one device, S̄ is computed in the loop, and
@@ -242,7 +243,7 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float], aligned: 
     """Evaluate a trained model on the held-out views; return all of `run_row` but `devices` and `curve`."""
     import torch
 
-    from benchmarks import evaluate, viewpoints
+    from benchmarks import evaluate, moved, viewpoints
 
     pipeline = trainer.pipeline
     datamanager = pipeline.datamanager
@@ -270,6 +271,7 @@ def measure(trainer: Any, timer: LoopTimer, seconds: dict[str, float], aligned: 
         **seconds,
         **held_out,
         **angles_of_views(datamanager, model),
+        **moved.measures(pipeline),
         "differing_pixels": differing,
         "gaussians": int(model.num_points),
         "peak_gb": timer.peak_gb,

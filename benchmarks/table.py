@@ -264,6 +264,9 @@ COLUMNS: dict[str, tuple[str, Callable[[Run], str]]] = {
     "gain_psnr": ("PSNR, photo's gain", _spread("gain_psnr", 2)),
     "gain_ssim": ("SSIM, photo's gain", _spread("gain_ssim", 4)),
     "gain_lpips": ("LPIPS, photo's gain", _spread("gain_lpips", 4)),
+    "moved_iou": ("Moved, overlap", _spread("moved_iou", 2)),
+    "moved_share": ("Left out", _spread("moved_share", 4)),
+    "moved_wrong": ("Wrongly left out", _spread("moved_wrong", 4)),
     "gaussians": ("Gaussians", lambda run: count(run.mean("gaussians"))),
     "peak": ("Peak GB", lambda run: number(run.mean("peak_gb"), 1)),
     "seeds": ("Seeds", Run.seeds),
@@ -317,6 +320,9 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
     if any(row.get("aligned_psnr") is not None for row in last):
         place = columns.index("gaussians")
         columns[place:place] = ["aligned_psnr", "aligned_ssim", "aligned_lpips"]
+    if any(row.get("moved_share") is not None for row in last):
+        place = columns.index("gaussians")
+        columns[place:place] = ["moved_iou", "moved_share", "moved_wrong"]
     lines = [of_runs(runs, columns, strict=False)]
     sentences = [*_spreads_over_scenes(grouped), *_faults(last)]
     if sentences:

@@ -18,7 +18,7 @@ def normals_map(params: Mapping[str, Tensor], camera: Cameras, drawing: RenderOp
     """Return the blended normals of the Gaussians, of unit length in world axes, 0 where nothing is drawn. [H, W, 3]
 
     A Gaussian's normal is the axis of its smallest scale, turned towards the camera. This is an estimate, because
-    training does not flatten Gaussians; normals of the depth map are rougher (docs/guide.md has both measured).
+    training does not flatten Gaussians; those of the depth map are as rough (docs/guide-viewing.md has both).
     The arguments are those of `blend`.
     """
     quats = F.normalize(params["quats"], dim=-1)

@@ -231,6 +231,9 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
     None takes one more for every 2,000 renderings of the run, up to 4. The paper uses 1 outdoors, 2 indoors."""
+    find_moved: bool = False
+    """Whether to find what moved while the photos were taken, such as people and cars, and to leave it out.
+    It is judged a few times by the run itself; the run's folder keeps `masks` of what was found."""
     memory_budget_gb: float | None = None
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
     None is 80 % of the free memory. If `max_gaussians` was changed, None leaves it as it is."""

@@ -15,6 +15,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.trainer import Trainer
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline
 from torch import Tensor
 
@@ -30,9 +31,11 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
+from sadgs_ns.training.exposure_table import photo_names
 from sadgs_ns.training.model import NORMALS, SadgsModel
 from sadgs_ns.training.run.checkpoints import check_number_of_views
 from sadgs_ns.training.run.memory_plan import choose_image_storage
+from sadgs_ns.training.run.moved_search import MovedSearch
 from sadgs_ns.training.run.point_observations import PointObservations
 from sadgs_ns.training.run.progress import note, warn
 from sadgs_ns.training.run.run_plan import RunPlan, unknown_fields
@@ -90,6 +93,7 @@ class SadgsPipeline(VanillaPipeline):
             energy_blur=config.energy_blur,
             epsilon=config.epsilon,
         )
+        self.moved_search = MovedSearch(self.structure_cache)
         self.log = NonFiniteLog(self.device)
         self._infos: list[dict[str, Any]] = []  # The rasterizer's, of the last step until densification has read them
         self._means_gradient: Tensor | None = None  # [N, 3], of the last step
@@ -217,8 +221,10 @@ class SadgsPipeline(VanillaPipeline):
             TrainingCallback([step_end], lambda step: self._report_nonfinite_if_full()),
             *super().get_training_callbacks(training_callback_attributes),
             TrainingCallback([step_end], lambda step: self._densify()),
+            TrainingCallback([step_end], lambda step: self._find_moved(step)),
             TrainingCallback([step_end, run_end], lambda step: self.structure.refresh()),
             TrainingCallback([run_end], lambda step: self._report_nonfinite(last=True)),
+            TrainingCallback([run_end], lambda step: self._report_moved(training_callback_attributes.trainer)),
         ]
 
     def _densify(self) -> None:
@@ -226,6 +232,16 @@ class SadgsPipeline(VanillaPipeline):
         self.model.densify(self._infos)
         self._infos = []  # They hold large tensors.
         self.model.finish_step()
+
+    def _find_moved(self, step: int) -> None:
+        """Judge what moved in the training photos, if the option asks for it and that is due after a step."""
+        if self.config.find_moved and self.moved_search.is_due(step):
+            self.moved_search.judge()
+
+    def _report_moved(self, trainer: Trainer | None) -> None:
+        """Say what was left out, and write masks of it into the run's folder."""
+        if trainer is not None and self.model.world.rank == 0:
+            self.moved_search.report(trainer.base_dir)
 
     def _report_nonfinite_if_full(self) -> None:
         if self.log.full:
@@ -300,7 +316,7 @@ class SadgsPipeline(VanillaPipeline):
         """Draw the views of a step, bring their images to the device, and group them by their sizes."""
         self._repeat_overflowed()
         model = self.model
-        groups: dict[tuple[int, ...], list[tuple[int, dict[str, Any]]]] = defaultdict(list)
+        groups: dict[tuple[int, ...], list[tuple[int, Mapping[str, Any]]]] = defaultdict(list)
         for index, data in self.views.draw(model.plan.views_per_iteration):
             if model.world.is_single:
                 size = data["image"].shape
@@ -374,9 +390,15 @@ class SadgsPipeline(VanillaPipeline):
             "images": [path.name for path in self.datamanager.train_dataset.image_filenames],
             "camera_positions": camera_positions(self.datamanager.train_dataset.cameras),
         }
+        if len(self.views.moved):
+            state["moved"] = self.views.moved.state_dict(self._photo_names)
         if self.device.type == "cuda":
             state["cuda"] = torch.cuda.get_rng_state(self.device)
         return state
+
+    @property
+    def _photo_names(self) -> list[str]:
+        return photo_names(self.datamanager.train_dataset.image_filenames)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Restore what `get_extra_state` saved; the order of the views only if their number is the same.
@@ -391,6 +413,10 @@ class SadgsPipeline(VanillaPipeline):
         self.follow(plan)
         torch.set_rng_state(state["torch"].cpu())
         self.views.sampler.load_state_dict(state["views"])
+        moved = state.get("moved", {})
+        if not self.config.find_moved:
+            moved = {}
+        self.views.moved.load_state_dict(moved, self._photo_names, self.device)
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
 

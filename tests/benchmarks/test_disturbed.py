@@ -262,7 +262,14 @@ def parser_of(label: str, copy: Path, work: Path) -> Any:
 
 @pytest.mark.parametrize(
     ("label", "folder", "has_masks"),
-    [("clean", "images", False), ("disturbed", "disturbed", False), ("true masks", "disturbed", True)],
+    [
+        ("clean", "images", False),
+        ("disturbed", "disturbed", False),
+        ("true masks", "disturbed", True),
+        ("finding", "disturbed", False),
+        ("finding, clean", "images", False),
+        ("finding, true masks", "disturbed", True),
+    ],
 )
 def test_rows_of_the_protocol_read_the_photos_and_masks_that_they_name(
     label: str, folder: str, has_masks: bool, copy: Path, tmp_path: Path

@@ -21,9 +21,9 @@ from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
-OF_PHOTOS = ("chain", "disturbed-cameras", "placing", "seconds")
-"""Protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
-PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OF_PHOTOS)
+OTHERS = ("captures", "chain", "disturbed-cameras", "placing", "seconds")
+"""The description of the captures, and protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
+PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OTHERS)
 OPTIONS = {"colmap_path": "sparse/0", "downscale_factor": 4}
 
 

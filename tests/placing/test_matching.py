@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import shutil
-import sqlite3
 from pathlib import Path
 from types import ModuleType
 
@@ -14,6 +12,8 @@ import pytest
 import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter
+
+from helpers.colmap_database import rows_of
 
 
 @pytest.fixture(scope="module")
@@ -110,12 +110,6 @@ def verification_options():
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = 0
     return options
-
-
-def rows_of(database: Path, table: str) -> list[tuple]:
-    """All that a table of COLMAP's database holds, byte by byte."""
-    with contextlib.closing(sqlite3.connect(database)) as opened:
-        return opened.execute(f"SELECT * FROM {table} ORDER BY pair_id").fetchall()
 
 
 def test_photos_are_related_as_by_colmap_s_own_matches(matching: ModuleType, tmp_path: Path):

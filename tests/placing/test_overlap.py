@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.colmap_database import rows_of
 from helpers.drawn_photos import draw_photos
 from sadgs_ns.placing.plan import Matching
 
@@ -161,7 +162,6 @@ def test_an_error_of_the_thread_is_raised_and_an_error_of_the_block_ends_it(ahea
 
 @pytest.mark.parametrize("way", ["exhaustive", "sequential", "similar"])
 def test_the_database_is_the_same_as_without(ahead: ModuleType, tmp_path: Path, way: Matching):
-    from placing.test_matching import rows_of
     from sadgs_ns.placing import reconstruct
     from sadgs_ns.placing.features import extract
 

@@ -43,6 +43,7 @@ RUN_BY = {
     "make lint": ".ci/run",
     "make gate": ".ci/run",
     "make docs": ".ci/run",
+    "make turn": "tests/drawn_scene/test_turn.py::test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians",
     ".ci/run": ".github/workflows/tests.yml",
     "sadgs": "tests/cli/test_sadgs.py::test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothing",
     "sadgs photos": "tests/cli/test_sadgs.py::"
@@ -56,6 +57,7 @@ RUN_BY = {
     "test_what_is_taken_away_is_told_and_not_in_the_file",
     "python -m benchmarks PROTOCOL.yaml": "Makefile",
     "python -m benchmarks table": "tests/benchmarks/test_table.py::test_the_command_prints_the_table_and_draws_a_plot",
+    "python -m benchmarks captures": "tests/benchmarks/test_captures.py::test_what_matches_is_told_to_match",
     "python -m benchmarks chain": "tests/benchmarks/test_chain.py::test_the_protocol_names_eight_captures",
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
     "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",

@@ -60,7 +60,8 @@ class StructureCache:
             for index, data in enumerate(images):
                 by_size[data["image"].shape[:2]].append(index)
             for indices in by_size.values():
-                self._kept.update(zip(indices, self.quantized([images[index] for index in indices]), strict=True))
+                tensors = self.quantized([self.views.cached(index) for index in indices])
+                self._kept.update(zip(indices, tensors, strict=True))
         self.filled = True
 
     def __getitem__(self, index: int) -> Tensor:
@@ -68,7 +69,17 @@ class StructureCache:
         self.fill()
         if index in self._kept:
             return self._kept[index].to(self._device, non_blocking=True)
-        return next(self.quantized([self.views.datamanager.cached_train[index]]))
+        return next(self.quantized([self.views.cached(index)]))
+
+    def forget(self, indices: Sequence[int]) -> None:
+        """Compute S̄ of some views anew, at once or when it is needed, because their masks have changed."""
+        for index in indices:
+            if index not in self._kept:
+                continue
+            if self.views.prefetcher is None:
+                self._kept[index] = next(self.quantized([self.views.cached(index)]))
+            else:
+                del self._kept[index]
 
     def get(self, views: Sequence[tuple[int, Mapping[str, Any]]], world: World) -> list[Tensor]:
         """Return the quantized S̄ of a step's views of one size, in their order, on the device. uint8 [H, W, 3] each

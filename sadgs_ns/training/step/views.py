@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -18,6 +18,7 @@ from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.step.images import ImagePrefetcher, thread_count
+from sadgs_ns.training.step.moved_regions import MovedRegions
 
 
 class ViewSampler:
@@ -73,12 +74,17 @@ class ViewSampler:
 
 
 class TrainingViews:
-    """Draws training views, the same in all processes, and gives their images and corrected cameras."""
+    """Draws training views, the same in all processes, and gives their images and corrected cameras.
+
+    Attributes:
+        moved: Regions of photos that masks hide, too, because something moved there.
+    """
 
     def __init__(self, datamanager: FullImageDatamanager, model: SadgsModel) -> None:
         self.datamanager = datamanager
         self.model = model
         self.sampler = ViewSampler(len(datamanager.train_dataset), datamanager.config.train_cameras_sampling_seed)
+        self.moved = MovedRegions()
 
     def seed(self, seed: int) -> None:
         """Begin anew with rounds of views in an order that this seed decides."""
@@ -104,7 +110,7 @@ class TrainingViews:
         cameras = self.datamanager.train_dataset.cameras
         return list(zip(cameras.height.flatten().tolist(), cameras.width.flatten().tolist(), strict=True))
 
-    def draw(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+    def draw(self, number: int) -> list[tuple[int, Mapping[str, Any]]]:
         """Return index and data of each view of the next step, and prefetch images of later ones.
 
         The image is on the training device, and so is the mask if it was prefetched. With several processes, prefetched
@@ -115,7 +121,8 @@ class TrainingViews:
         if prefetcher is None:
             cached = self.datamanager.cached_train
             device = self.model.device
-            return [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
+            drawn = [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
+            return [(i, self.moved.applied(i, data)) for i, data in drawn]
         data = prefetcher.take(self._composited(indices))
         share = math.ceil(number / self.model.world.num_ranks)
         threads = prefetcher.threads
@@ -123,7 +130,11 @@ class TrainingViews:
         # The number of views under way is the same in each step, so that none is forgotten before its step.
         most = max(threads + 2 * share, len(steps[0]))
         prefetcher.prefetch(list(dict.fromkeys(chain(*steps)))[:most], following=steps[0])
-        return [(index, data.get(index, {})) for index in indices]
+        return [(index, self.moved.applied(index, data.get(index, {}))) for index in indices]
+
+    def cached(self, index: int) -> Mapping[str, Any]:
+        """Data of a training view where the datamanager keeps it, with a mask that hides what moved, too."""
+        return self.moved.applied(index, self.datamanager.cached_train[index])
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""

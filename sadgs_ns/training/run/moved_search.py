@@ -1,0 +1,269 @@
+"""Find what moved while the photos were taken, at a few times of a run, and leave it out from there on."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.files import atomic_path
+from sadgs_ns.geometry import moved
+from sadgs_ns.geometry.moved import SmallView, Spread
+from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
+from sadgs_ns.method.schedule import DENSIFICATION_SHARE
+from sadgs_ns.render.types import Cameras, Gaussians
+from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.step.color_matrices import correct_colors
+from sadgs_ns.training.step.images import thread_count
+from sadgs_ns.training.step.structure_cache import StructureCache
+
+JUDGED_AT = (1 / 4, 1 / 2, 1.0, 11 / 8)
+"""Times of judging as shares of densification, each an iteration before Gaussians are added, removed or reset. Later
+ones take wrong verdicts back, and find what the first left."""
+FEWEST_VIEWS = 3
+"""Training views from which something can be found: others must deny what one shows."""
+MASKS = "masks"
+"""Name of the folder, in a run's, for masks of the photos in which something moved."""
+_DRAWN_TOGETHER = 4  # Views, which take less time than one after another
+_COVERED = 0.5  # Opacity from which a pixel's depth is that of something
+_VALID = 0.99  # Share of a small pixel that masks must leave
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The evidence of all views, and what follows from it."""
+
+    views: list[SmallView]
+    excesses: list[Tensor]  # NaN where unknown. [h, w] each
+    limits: Spread
+    regions: dict[int, Tensor]  # By view, 1 where something moved. uint8 [h, w]
+
+
+@lru_cache(maxsize=8)
+def judged_steps(iterations: int, refine_stop_iter: int) -> frozenset[int]:
+    """Return the steps after which a run judges, given its length and the end of its densification, 0 if it has none.
+
+    Steps are counted from 0.
+    """
+    end = refine_stop_iter
+    if end == 0:
+        end = round(DENSIFICATION_SHARE * iterations)
+    steps = [round(share * end) - 2 for share in JUDGED_AT]
+    return frozenset(step for step in steps if 0 <= step < iterations - 1)
+
+
+class MovedSearch:
+    """Judges the training views of a run, and tells the views and their structure tensors what to leave out."""
+
+    def __init__(self, structure_cache: StructureCache) -> None:
+        self._cache = structure_cache
+        self._views = structure_cache.views
+        self._model = structure_cache.views.model
+
+    def is_due(self, step: int) -> bool:
+        """Tell whether the views are judged after a step."""
+        if len(self._views) < FEWEST_VIEWS:
+            return False
+        return step in judged_steps(self._model.plan.iterations, self._model.strategy.windows.refine_stop_iter)
+
+    def judge(self) -> None:
+        """Judge all training views anew, and leave out what moved by the present Gaussians.
+
+        All processes call this. Nothing is random, and nothing of the run changes if nothing is found. One process
+        keeps what it left out if the device's memory is full, and prints that.
+        """
+        world = self._model.strategy.world
+        try:
+            views = self._small_views()
+            found: dict[int, Tensor] = {}
+            if world.rank == 0:
+                found = verdict(views).regions
+        except torch.cuda.OutOfMemoryError:
+            if not world.is_single:  # The others would wait for this one.
+                raise
+            warn(f"Iteration {self._model.step + 1}: the device's memory is too full to find what moved.")
+            return
+        if not world.is_single:
+            found = self._shared(found)
+        self._cache.forget(self._views.moved.replace(found))
+
+    @torch.no_grad()
+    def _small_views(self) -> list[SmallView]:
+        """Draw all training views at working size, and compare them with their photos; only rank 0 returns them."""
+        gaussians, _ = self._model.gaussians()
+        is_first = self._model.strategy.world.rank == 0
+        photos = self._photos()
+        views = []
+        for indices in self._batches():
+            colors, depths, cameras = self._draw(gaussians, indices)
+            if not is_first:
+                continue
+            size = (cameras.height, cameras.width)
+            for color, depth, viewmat, K in zip(colors, depths, cameras.viewmats, cameras.Ks, strict=True):
+                photo, valid = self._small_photo(next(photos), size)
+                views.append(SmallView(moved.difference(photo, color, valid), depth, valid, viewmat, K))
+        return views
+
+    def _batches(self) -> Iterator[list[int]]:
+        """Yield the training views in their order, as many at once as are drawn together; these have one size."""
+        for _, views in groupby(range(len(self._views)), key=lambda index: self._views.sizes[index]):
+            same_size = list(views)
+            for start in range(0, len(same_size), _DRAWN_TOGETHER):
+                yield same_size[start : start + _DRAWN_TOGETHER]
+
+    def _photos(self) -> Iterator[Mapping[str, Any]]:
+        """Yield the datamanager's data of all training views in their order; threads decode compressed images."""
+        images = self._views.datamanager.cached_train
+        if isinstance(images, list):
+            yield from images
+            return
+        threads = thread_count(self._views.datamanager.config.max_thread_workers)
+        with ThreadPoolExecutor(threads) as pool:
+            for start in range(0, len(images), 2 * threads):  # The host may have no room for all.
+                yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
+
+    def _draw(self, gaussians: Gaussians, indices: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
+        """Draw V views of one size at working size with their photos' gains; all processes have the whole pictures.
+
+        Returns colours in [0, 1] [V, 3, h, w], depths [V, h, w] and the small cameras.
+        """
+        model = self._model
+        world = model.strategy.world
+        full_height, full_width = self._views.sizes[indices[0]]
+        height, width = moved.working_size((full_height, full_width))
+        viewmats, Ks = self._views.stacked_cameras(indices)
+        scale = Ks.new_tensor([width / full_width, height / full_height, 1.0])
+        cameras = Cameras(viewmats, Ks * scale[:, None], width, height)
+        pictures, _ = rasterize(world, gaussians, cameras, model.color_options(expected_depth=True))
+        whole = viewmats.new_zeros((len(indices), height, width, 5))
+        for band, rendered, opacity in pictures:
+            joined = torch.cat([rendered, opacity], dim=-1)
+            if band is None:
+                whole = joined
+            else:
+                rows = slice(band.first - band.top, band.last - band.top)
+                whole[band.view, band.first : band.last] = joined[0, rows]
+        world.sum(whole)
+        colors = whole[..., :3].contiguous()
+        alphas = whole[..., 4:].contiguous()
+        view_ids = model.view_ids(indices)
+        if model.has_view_colors and view_ids is not None:
+            colors = correct_colors(colors, alphas, model.view_matrices(model.trained_params, view_ids))
+        colors = model.before_background(colors, alphas, model.background).clamp(0, 1)
+        depths = torch.where(alphas[..., 0] > _COVERED, whole[..., 3], 0.0)
+        return colors.movedim(-1, 1), depths, cameras
+
+    @torch.no_grad()
+    def pictures(self, index: int) -> tuple[Tensor, Tensor]:
+        """Return the photo of a view and its rendering, which this process draws alone, at working size. [3, h, w]"""
+        gaussians, _ = self._model.gaussians()
+        colors, _, cameras = self._draw(gaussians, [index])
+        data = self._views.datamanager.cached_train[index]
+        photo, _ = self._small_photo(data, (cameras.height, cameras.width))
+        return photo, colors[0]
+
+    def _small_photo(self, data: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Return a photo in [0, 1] [3, h, w], and where no mask hides it, bool [h, w], at a size in px."""
+        photo = _reduced(self._model.photo(data)[..., :3], size)
+        valid = torch.ones(size, dtype=torch.bool, device=photo.device)
+        if "mask" in data:
+            valid = _reduced(data["mask"].to(photo), size)[0] > _VALID
+        return photo, valid
+
+    def _shared(self, found: Mapping[int, Tensor]) -> dict[int, Tensor]:
+        """Return the regions that rank 0 found, in all processes."""
+        world = self._model.strategy.world
+        number = len(self._views)
+        flags = torch.tensor([int(view in found) for view in range(number)], device=world.device)
+        world.broadcast(flags, 0)
+        shared = {}
+        for view in flags.nonzero()[:, 0].tolist():
+            size = moved.working_size(self._views.sizes[view])
+            region = found.get(view, torch.zeros(size, dtype=torch.uint8, device=world.device)).contiguous()
+            world.broadcast(region, 0)
+            shared[view] = region
+        return shared
+
+    def evidence(self) -> Verdict:
+        """Return what speaks for things that moved by the present Gaussians, without leaving anything out."""
+        return verdict(self._small_views())
+
+    def report(self, folder: Path) -> None:
+        """Print how much is left out, and write masks of the photos into a run's folder; nothing if nothing moved.
+
+        Raises WriteError if the disk is full.
+        """
+        regions = self._views.moved
+        if not len(regions):
+            return
+        shares = [regions.share(view) for view in regions.views]
+        mean = sum(shares) / len(shares)
+        written = self._write_masks(folder / MASKS)
+        warn(
+            f"Something moved in {len(regions)} of {len(self._views)} training photos, in {mean:.1%} of their pixels, "
+            f"which were left out: see {written}. --pipeline.find-moved False leaves nothing out."
+        )
+
+    def _write_masks(self, folder: Path) -> Path:
+        """Write a black and white mask of each photo that has a region, and return the folder."""
+        files = self._views.datamanager.train_dataset.image_filenames
+        root = common_folder(files)
+        images = self._views.datamanager.cached_train
+        for view in self._views.moved.views:
+            data = self._views.moved.applied(view, images[view])
+            # A picture of one bit takes a hundredth of the time.
+            picture = Image.fromarray(data["mask"][..., 0].cpu().numpy())
+            name = files[view].relative_to(root).with_suffix(".png")
+            with atomic_path(folder / name) as partial:
+                picture.save(partial, format="PNG")
+        return folder
+
+
+def common_folder(files: Sequence[Path]) -> Path:
+    """Return the folder that holds all files, in it or below."""
+    return Path(os.path.commonpath([file.parent for file in files]))
+
+
+def verdict(views: Sequence[SmallView]) -> Verdict:
+    """Judge views by each other."""
+    points = moved.surface_points(views)
+    neighbours = [[] for _ in views]
+    if len(points):
+        viewmats = torch.stack([view.viewmat for view in views]).double()
+        Ks = torch.stack([view.K for view in views]).double()
+        sizes = points.new_tensor([[view.depth.shape[1], view.depth.shape[0]] for view in views])
+        chosen = choose_neighbours(viewmats, Ks, sizes, points, moved.NEIGHBOURS).tolist()
+        neighbours = [[other for other in row if other >= 0] for row in chosen]
+    excesses = []
+    for view, row in zip(views, neighbours, strict=True):
+        excesses.append(moved.excess(view, [views[other] for other in row]))
+    limits = moved.spread(excesses)
+    regions = {}
+    for index, (view, values) in enumerate(zip(views, excesses, strict=True)):
+        region = moved.region(view, values, limits)
+        if region is not None:
+            regions[index] = torch.from_numpy(region.astype(np.uint8)).to(values.device)
+    return Verdict(list(views), excesses, limits, regions)
+
+
+def _reduced(
+    image: Tensor,  # Floats [H, W, C]
+    size: tuple[int, int],  # Height and width in px
+) -> Tensor:
+    """Reduce an image to a size. [C, h, w]"""
+    planes = image.movedim(-1, 0)[None]
+    if planes.shape[2:] == size:
+        return planes[0]
+    return F.interpolate(planes, size, mode="area")[0]

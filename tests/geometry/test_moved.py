@@ -1,0 +1,162 @@
+"""What one view shows and the others deny, on a drawn wall that five cameras see."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from sadgs_ns.geometry import moved
+from sadgs_ns.geometry.moved import SmallView, Spread, difference, excess, region, spread, surface_points, working_size
+
+HEIGHT, WIDTH = 40, 60
+WALL = 4.0
+"""Depth of the wall."""
+THING = (slice(12, 24), slice(20, 32))
+"""Rows and columns of what one photo shows."""
+LIMITS = Spread(0.0, 0.005)
+
+
+def view_at(x: float, differing: Tensor | None = None, depth: float = WALL, valid: Tensor | None = None) -> SmallView:
+    """A camera at x that looks at the wall, and differs from its photo in some pixels, bool [h, w]."""
+    viewmat = torch.eye(4)
+    viewmat[0, 3] = -x
+    K = torch.tensor([[40.0, 0.0, WIDTH / 2], [0.0, 40.0, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    values = torch.zeros(HEIGHT, WIDTH)
+    if differing is not None:
+        values[differing] = 0.3
+    if valid is None:
+        valid = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    return SmallView(values, torch.full((HEIGHT, WIDTH), depth), valid, viewmat, K)
+
+
+def pixels(rows: slice, columns: slice) -> Tensor:
+    chosen = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    chosen[rows, columns] = True
+    return chosen
+
+
+def thing_on_the_wall(x: float) -> Tensor:
+    """Pixels in which a camera at x sees the place of the wall that the camera at 0 sees behind the thing."""
+    rows, columns = THING
+    shift = round(-40 * x / WALL)
+    return pixels(rows, slice(columns.start + shift, columns.stop + shift))
+
+
+def test_large_photos_are_reduced_and_small_ones_stay():
+    assert working_size((1200, 1600)) == (300, 400)
+    assert working_size((90, 120)) == (90, 120)
+    assert working_size((1, 5000)) == (1, 400)
+
+
+def test_an_edge_a_pixel_beside_its_place_is_no_difference_and_another_colour_is_one():
+    photo = torch.zeros(3, HEIGHT, WIDTH)
+    photo[:, :, 30:] = 1.0
+    drawn = torch.zeros(3, HEIGHT, WIDTH)
+    drawn[:, :, 31:] = 1.0
+    everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    assert float(difference(photo, drawn, everywhere).max()) < 1e-6
+    other = difference(photo, 1 - photo, everywhere)
+    torch.testing.assert_close(other[20, 5], torch.tensor(1.0))
+
+
+def test_hidden_pixels_do_not_differ_and_do_not_reach_those_beside_them():
+    photo = torch.zeros(3, HEIGHT, WIDTH)
+    hidden = pixels(*THING)
+    photo[:, hidden] = 1.0
+    found = difference(photo, torch.zeros_like(photo), ~hidden)
+    assert float(found.max()) < 1e-6
+
+
+def test_what_one_view_shows_alone_is_in_its_excess():
+    views = [view_at(0.0, pixels(*THING)), view_at(-0.4), view_at(0.4), view_at(0.8)]
+    found = excess(views[0], views[1:])
+    inside = pixels(*THING)
+    torch.testing.assert_close(found[inside], torch.full((144,), 0.3))
+    assert float(found[~inside & found.isfinite()].abs().max()) == 0.0
+
+
+def test_what_no_view_has_learned_yet_is_not():
+    views = [view_at(x, thing_on_the_wall(x)) for x in (0.0, -0.4, 0.4, 0.8)]
+    found = excess(views[0], views[1:])
+    assert float(found.nan_to_num(-1.0).max()) <= 0.0
+
+
+def test_views_in_which_something_nearer_stands_before_the_point_deny_nothing():
+    views = [view_at(0.0, pixels(*THING)), view_at(-0.4, depth=1.0), view_at(0.4, depth=1.0), view_at(0.8)]
+    assert bool(excess(views[0], views[1:]).isnan().all())
+
+
+def test_views_that_look_through_a_point_at_what_is_behind_deny_it():
+    thing = pixels(*THING)
+    near = view_at(0.0, thing)
+    near.depth[thing] = 3.0
+    found = excess(near, [view_at(-0.4), view_at(0.4), view_at(0.8)])
+    torch.testing.assert_close(found[thing], torch.full((144,), 0.3))
+
+
+def test_too_few_views_and_hidden_pixels_are_no_evidence():
+    hidden = pixels(slice(0, HEIGHT), slice(0, 30))
+    masked = view_at(0.0, pixels(*THING), valid=~hidden)
+    found = excess(masked, [view_at(-0.4), view_at(0.4), view_at(0.8)])
+    assert bool(found[hidden].isnan().all())
+    assert bool(excess(view_at(0.0), [view_at(0.4)]).isnan().all())
+    blind = view_at(0.4, valid=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
+    assert bool(excess(view_at(0.0), [blind, view_at(-0.4)]).isnan().all())
+
+
+def test_the_spread_is_that_of_most_pixels_whatever_a_few_are():
+    generator = torch.Generator().manual_seed(0)
+    values = 0.01 * torch.randn((100, 100), generator=generator)
+    values[:10] = 5.0
+    values[10] = math.nan
+    limits = spread([values])
+    assert limits.deviation == pytest.approx(0.01, rel=0.2) and abs(limits.median) < 0.005
+    assert limits.strong == pytest.approx(limits.median + moved.STRONG * limits.deviation)
+    assert spread([torch.full((4, 4), math.nan)]) == Spread(0.0, 0.0)
+
+
+def test_small_excesses_are_no_reason_however_alike_all_others_are():
+    limits = Spread(0.0, 0.0)
+    assert limits.strong == moved.LEAST_EXCESS and 0 < limits.weak < limits.strong
+
+
+def test_a_region_covers_what_moved_and_fills_its_holes():
+    values = torch.zeros(HEIGHT, WIDTH)
+    thing = pixels(*THING)
+    values[thing] = 0.3
+    values[16:19, 24:27] = 0.0
+    found = region(view_at(0.0), values, LIMITS)
+    assert found is not None
+    assert found[thing.numpy()].all()
+    assert found.sum() <= (12 + 2 * moved.DILATION) ** 2
+
+
+def test_single_pixels_and_weak_regions_are_none():
+    values = torch.zeros(HEIGHT, WIDTH)
+    values[::7, ::7] = 0.5
+    assert region(view_at(0.0), values, LIMITS) is None
+    values = torch.zeros(HEIGHT, WIDTH)
+    values[THING] = 0.5 * (LIMITS.weak + LIMITS.strong)
+    assert region(view_at(0.0), values, LIMITS) is None
+
+
+def test_a_region_goes_on_where_the_excess_is_unknown_if_the_pixels_differ_much():
+    thing = pixels(*THING)
+    values = torch.zeros(HEIGHT, WIDTH)
+    values[thing] = 0.3
+    values[:18] = math.nan  # Sky, which the upper half of the thing stands before
+    upper = thing & values.isnan()
+    found = region(view_at(0.0, thing), values, LIMITS)
+    assert found is not None and found[upper.numpy()].all()
+    found = region(view_at(0.0), values, LIMITS)
+    assert found is not None and found[upper.numpy()].mean() < 0.5
+
+
+def test_points_lie_on_what_is_drawn():
+    nothing = view_at(0.4, depth=0.0)
+    points = surface_points([view_at(0.0), nothing])
+    assert len(points) > 500
+    torch.testing.assert_close(points[:, 2], torch.full((len(points),), WALL, dtype=torch.float64))
