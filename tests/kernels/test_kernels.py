@@ -99,7 +99,9 @@ def test_the_loss_does_not_depend_on_how_many_rows_a_program_handles(monkeypatch
 def test_programs_of_the_loss_cover_the_images_and_run_at_the_same_time(size):
     views, height, row = size
     (columns, strips, of_views), rows = photometric._strips(*size)
-    assert columns * photometric._COLUMNS >= row and strips * rows >= height and of_views == views
+    assert columns * photometric._COLUMNS >= row
+    assert strips * rows >= height
+    assert of_views == views
     assert columns * strips * views <= photometric._PROGRAMS
 
 

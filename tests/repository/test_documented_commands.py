@@ -62,8 +62,9 @@ RUN_BY = {
     "python -m benchmarks cameras": "tests/benchmarks/test_cameras.py::"
     "test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed",
     "python -m benchmarks seconds": "tests/benchmarks/test_seconds.py::test_the_parts_of_a_command_are_measured_once",
-    "python -m benchmarks kernels": "tests/benchmarks/test_kernels.py::test_the_command_writes_a_row_for_each_kernel",
-    "python -m benchmarks startup": "tests/benchmarks/test_startup.py::"
+    "python -m benchmarks kernels": "tests/benchmarks/test_kernel_table.py::"
+    "test_the_command_writes_a_row_for_each_kernel",
+    "python -m benchmarks startup": "tests/benchmarks/test_startup_table.py::"
     "test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones",
     "python -m benchmarks documents": "tests/repository/test_docs.py::test_tables_are_what_their_rows_give",
 }

@@ -187,6 +187,7 @@ def test_a_run_goes_on_with_fewer_processes(scene: Path, tmp_path: Path):
     assert alone["gaussians"] == pytest.approx(expected["gaussians"], rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_whole_run_reaches_the_quality_of_one_process(scene: Path, tmp_path: Path):
     def configured(name: str) -> SadgsTrainerConfig:
         config = configure(scene, tmp_path / name, 50, save_every=0)

@@ -42,13 +42,19 @@ def test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones(
     given = ["startup", "--data", str(tmp_path / "room"), "--output", str(output), "--later", "1", "--iterations", "9"]
     assert bench.main(given) == 0
     rows = results.read(output)
-    assert [(row["label"], row["first"]) for row in rows] == [(way, first) for first in (True, False) for way in WAYS]
-    assert all(row["wait"] == pytest.approx(2, abs=0.5) and row["trained"] > row["wait"] for row in rows)
+    actual = [(row["label"], row["first"]) for row in rows]
+    expected = [(way, first) for first in (True, False) for way in WAYS]
+    assert actual == expected
+    for row in rows:
+        assert row["wait"] == pytest.approx(2, abs=0.5)
+        assert row["trained"] > row["wait"]
     measured = started[1:]  # The first run is not measured.
     caches = [run["cache"] for run in measured]
-    assert len({*caches}) == len(WAYS) and caches[: len(WAYS)] == caches[len(WAYS) :]
+    assert len({*caches}) == len(WAYS)
+    assert caches[: len(WAYS)] == caches[len(WAYS) :]
     assert started[0]["cache"] not in caches
-    assert all("--max-num-iterations 9" in " ".join(run["words"]) for run in started)
+    for run in started:
+        assert "--max-num-iterations 9" in " ".join(run["words"])
     assert "| sadgs without compile_ahead | " in capsys.readouterr().out
 
 
@@ -58,7 +64,8 @@ def test_a_run_that_fails_has_a_row_that_says_so(started: list[dict[str, Any]], 
     given = ["startup", "--data", str(tmp_path / "fails"), "--output", str(output), "--ways", "sadgs", "--later", "0"]
     assert bench.main(given) == 1
     (row,) = results.read(output)
-    assert row["status"] == "failed" and row["error"].startswith("CalledProcessError")
+    assert row["status"] == "failed"
+    assert row["error"].startswith("CalledProcessError")
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,8 @@ def drawn(absgrad: bool) -> dict[str, Tensor]:
         gradient = getattr(means2d, "grad2d", None)
         found |= {"absgrad": means2d.absgrad, "grad2d": means2d.grad if gradient is None else gradient}
     if "pair_counts" in info:
-        assert all(count > 100 for count in info["pair_counts"].wait())
+        for count in info["pair_counts"].wait():
+            assert count > 100
         assert info["overflowed"].tolist() == [0]
     return {name: value.detach() for name, value in found.items() if value is not None}
 
@@ -125,11 +126,18 @@ def test_gsplat_s_twins_draw_what_the_kernels_draw(name: str, monkeypatch: pytes
 def test_steps_are_taken_between_two_densifications_by_absgs_and_after_the_last():
     # 30 parts of 70 iterations; structure steps end the 5th, 10th and 15th.
     early, late = phases_of(windows(2088), 2088)
-    assert (early.begin, early.steps, early.weight, early.captures) == (8 * 70, 70, 16 * 70, True)
-    assert (late.begin, late.steps, late.weight, late.captures) == ((1120 + 2088) // 2, 100, 2088 - 1120, False)
+    assert early.begin == 8 * 70
+    assert early.steps == 70
+    assert early.weight == 16 * 70
+    assert early.captures is True
+    assert late.begin == (1120 + 2088) // 2
+    assert late.steps == 100
+    assert late.weight == 2088 - 1120
+    assert late.captures is False
     early, late = phases_of(windows(2088, structure_every=630), 2088)
     assert early.begin == 7 * 70
-    assert phases_of(windows(60), 60)[1].steps == 60 - (32 + 60) // 2
+    actual = phases_of(windows(60), 60)[1].steps
+    assert actual == 60 - (32 + 60) // 2
 
 
 @pytest.fixture
@@ -139,8 +147,12 @@ def trainer(config: SadgsTrainerConfig) -> Any:
     config.pipeline.model.poses = "refined"
     config.pipeline.model.color_model = "affine"
     strategy = config.pipeline.model.strategy
-    strategy.absgs_every, strategy.structure_every, strategy.refine_stop_iter, strategy.reset_every = 2, 6, 8, 0
-    strategy.refine_start_iter, strategy.eta_every = 1, 1
+    strategy.absgs_every = 2
+    strategy.structure_every = 6
+    strategy.refine_stop_iter = 8
+    strategy.reset_every = 0
+    strategy.refine_start_iter = 1
+    strategy.eta_every = 1
     trainer = set_up(config)
     trainer.pipeline.train()
     return trainer
@@ -174,8 +186,10 @@ def test_what_was_timed_leaves_the_run_as_it_was(trainer: Any):
     trainer.pipeline.model.step = 3
     assert differences(before, without_random_numbers(state_of(trainer))) == []
     for of_twin in measured.values():
-        assert of_twin.error == "" and len(of_twin.seconds["densification"]) == 2
-        assert all(seconds > 0 for seconds in of_twin.seconds["densification"])
+        assert of_twin.error == ""
+        assert len(of_twin.seconds["densification"]) == 2
+        for seconds in of_twin.seconds["densification"]:
+            assert seconds > 0
     run_to(trainer, 4, 12)
     assert trainer.pipeline.model.num_gaussians > 0
 
@@ -201,7 +215,8 @@ def test_a_twin_that_fails_has_the_error_and_others_go_on(trainer: Any):
 
 
 def test_launches_are_kernels_of_the_gpu_without_copies():
-    cpu, cuda = SimpleNamespace(name="CPU"), SimpleNamespace(name="CUDA")
+    cpu = SimpleNamespace(name="CPU")
+    cuda = SimpleNamespace(name="CUDA")
     names = [("cudaLaunchKernel", cpu), ("_update", cuda), ("Memcpy DtoD (Device -> Device)", cuda), ("add", cuda)]
     events = [SimpleNamespace(name=name, device_type=kind) for name, kind in [*names, ("Memset (Device)", cuda)]]
     assert kernel_loops.launches_in(events) == 2
@@ -217,13 +232,21 @@ def test_a_row_has_the_loop_relative_to_that_with_all_kernels():
     tiles = Measured({"densification": [2.0, 1.5], "after": [0.5, 0.5]}, {"densification": 60.0, "after": 30.0})
     part = Part(JOB, {REFERENCE: None, "tiles": TWINS["tiles"]}, {}, is_short=False)
     first, second = kernel_share.rows_of(part, loop(tiles=tiles))
-    assert first["label"] == REFERENCE and first["ratio"] == 1 and first["steps_seconds"] == 5
-    assert first["launches"] == 25 and first["launches_with_kernel"] is None
-    assert second["key"] == "demo/tiles/0" and second["by"] == "gsplat" and second["launches"] == 50
+    assert first["label"] == REFERENCE
+    assert first["ratio"] == 1
+    assert first["steps_seconds"] == 5
+    assert first["launches"] == 25
+    assert first["launches_with_kernel"] is None
+    assert second["key"] == "demo/tiles/0"
+    assert second["by"] == "gsplat"
+    assert second["launches"] == 50
     assert second["launches_with_kernel"] == 25
-    assert (second["low"], second["ratio"], second["high"]) == pytest.approx((7 / 5, 8 / 5, 9 / 5))
+    actual = (second["low"], second["ratio"], second["high"])
+    expected = pytest.approx((7 / 5, 8 / 5, 9 / 5))
+    assert actual == expected
     assert second["ms"] == pytest.approx({"densification": 875, "after": 250})
-    assert "host waits" in second["no_graphs"] and first["no_graphs"] == ""
+    assert "host waits" in second["no_graphs"]
+    assert first["no_graphs"] == ""
 
 
 def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kernels():
@@ -241,24 +264,28 @@ def test_what_images_take_more_is_added_to_the_steps():
     measured = loop()
     measured.images.update({REFERENCE: 0.5, "quantization": 1.0})
     row = kernel_share.rows_of(part, measured)[1]
-    assert row["ratio"] == pytest.approx(5.5 / 5) and row["images_seconds"] == 1.0
+    assert row["ratio"] == pytest.approx(5.5 / 5)
+    assert row["images_seconds"] == 1.0
 
 
 def test_a_kernel_whose_twin_failed_has_a_row_that_says_so():
     part = Part(JOB, {REFERENCE: None, "tiles": TWINS["tiles"]}, {}, is_short=False)
     row = kernel_share.rows_of(part, loop(tiles=Measured(error="RuntimeError: no")))[1]
-    assert row["status"] == "failed" and row["error"] == "RuntimeError: no"
+    assert row["status"] == "failed"
+    assert row["error"] == "RuntimeError: no"
 
 
 def test_one_device_measures_all_kernels_but_those_that_send_and_two_only_these():
     plain, optional = kernel_share.parts_of(JOB, 1, (), with_options=True)
     names = {*plain.twins, *plain.once, *optional.twins}
     assert names == {REFERENCE, "no kernel", *TWINS} - {"exchange"}
-    assert optional.is_short and optional.job.row.overrides["pipeline.model.poses"] == "refined"
+    assert optional.is_short
+    assert optional.job.row.overrides["pipeline.model.poses"] == "refined"
     assert {*optional.twins} == {REFERENCE, "poses", "color_matrices"}
     assert len(kernel_share.parts_of(JOB, 1, (), with_options=False)) == 1
     (part,) = kernel_share.parts_of(JOB, 2, (), with_options=True)
-    assert [*part.twins] == [REFERENCE, "exchange"] and part.job.row.overrides == {"share_always": True}
+    assert [*part.twins] == [REFERENCE, "exchange"]
+    assert part.job.row.overrides == {"share_always": True}
     assert kernel_share.parts_of(JOB, 2, ("tiles",), with_options=True) == []
     (part,) = kernel_share.parts_of(JOB, 1, ("tiles",), with_options=True)
     assert [*part.twins] == [REFERENCE, "tiles"]
@@ -307,9 +334,13 @@ def test_the_command_writes_a_row_for_each_kernel(
     assert bench.main(words) == 0, capsys.readouterr().err
     rows = results.read(output)
     assert [row["label"] for row in rows] == [REFERENCE, "adam", "quantization", "poses"]
-    assert all(row["status"] == "ok" and row["ratio"] > 0 and row["iterations"] == 12 for row in rows)
+    for row in rows:
+        assert row["status"] == "ok"
+        assert row["ratio"] > 0
+        assert row["iterations"] == 12
     assert rows[1]["replayed"] == {"densification": 0, "after": 0}
-    assert {*rows[1]["ms"]} == {"densification", "after"} and {*rows[3]["ms"]} == {"densification"}
+    assert {*rows[1]["ms"]} == {"densification", "after"}
+    assert {*rows[3]["ms"]} == {"densification"}
     assert "| poses | torch |" in capsys.readouterr().out
 
 
