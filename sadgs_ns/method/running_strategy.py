@@ -36,7 +36,7 @@ from sadgs_ns.method.growth import (
 from sadgs_ns.method.ops import Optimizers, Params, State, map_opacities, opacities, rebalance
 from sadgs_ns.method.schedule import Windows, due, next_due
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
-from sadgs_ns.method.statistics import consistent, empty_statistics, observe
+from sadgs_ns.method.statistics import STATISTICS, consistent, empty_statistics, observe
 from sadgs_ns.render.step_memory import StepSize, affordable_growth, free_bytes
 
 Info = Mapping[str, Any]
@@ -99,7 +99,8 @@ class RunningStrategy(Strategy):
         """Observe η, and ask for the screen gradients, before `loss.backward()`."""
         if step >= self.windows.refine_stop_iter:
             return
-        if "n_total" not in state:
+        if not state.keys() >= STATISTICS.keys():
+            # A run begins, or goes on from a checkpoint of a version that had fewer statistics.
             _empty_state(params, state)
         for view in _views(info):
             if self.needs_absgrad(step):

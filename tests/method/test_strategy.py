@@ -162,6 +162,24 @@ def test_a_statistic_is_added_in_one_entry_and_stays_with_its_gaussians(monkeypa
     assert "eta_sum" not in state, "it ends with densification, like the others"
 
 
+def test_a_state_that_lacks_a_statistic_starts_anew(monkeypatch: pytest.MonkeyPatch):
+    """As of a checkpoint that a version without the statistic wrote."""
+    strategy = short()
+    params = random_params(60)
+    optimizers = adam(params)
+    state = strategy.initialize_state(scene_scale=1.0)
+    images = checker_images(1)
+    tensors = multiscale_structure_tensor(images)
+    scene = (images, tensors, *camera(WIDTH, HEIGHT))
+    for step in range(2):
+        training_step(strategy, params, optimizers, state, step, *scene)
+    assert state["n_total"].max() == 2
+    monkeypatch.setitem(STATISTICS, "eta_sum", Statistic((3,), lambda values, eta: values.add_(eta.nansum(0))))
+    training_step(strategy, params, optimizers, state, 2, *scene)
+    assert state["n_total"].max() == 1
+    assert torch.equal(state["eta_sum"], state["eta_max"])
+
+
 def longest(options: Any, params: Any, state: Any) -> Proposal:
     """A rule of growth: halve the longest axis of all, the longest first."""
     scales = params["scales"].detach()
