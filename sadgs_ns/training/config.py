@@ -101,7 +101,7 @@ class SadgsModelConfig(InstantiateConfig):
     """Number of random points to start from, if there are no SfM points or `random_init` is set."""
     random_scale: float = 10.0
     """Side of the cube around the origin in which random points are drawn, in the run's units."""
-    bounding_box_points: bool = True
+    bounding_box_points: Hidden[bool] = True
     """Also start from points on the faces of the SfM points' bounding box, which become sky and far background."""
     starts_per_pixel: Hidden[float] = 0.02
     """Most points to start from for each pixel of all training images, which only small images reach.
