@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.limits import check_pairs
+from sadgs_ns.kernels.shared import drawn
 
 _LANES = 32  # Gaussians that one program handles: one warp of them, so that a large Gaussian holds up only 31 others
 _FEW_PAIRS = 64
@@ -108,8 +109,10 @@ def _count(
     g = tl.program_id(0) * LANES + tl.arange(0, LANES)
     exists = g < n
     if CULL:
-        x = tl.load(means2d + 2 * g, exists, 0.0)
-        y = tl.load(means2d + 2 * g + 1, exists, 0.0)
+        # The projection writes no centre of the others.
+        has_centre = drawn(radii, g, exists, PER_GAUSSIAN)
+        x = tl.load(means2d + 2 * g, has_centre, 0.0)
+        y = tl.load(means2d + 2 * g + 1, has_centre, 0.0)
         near = (tl.abs(x - half_width) < reach_x) & (tl.abs(y - half_height) < reach_y)
         for i in tl.static_range(PER_GAUSSIAN):
             tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & ~near)
