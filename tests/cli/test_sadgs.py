@@ -287,6 +287,7 @@ def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_spl
     "fewer than half of the photos of `sadgs` register",
     "it ends before training, and says what helps; `--anyway` goes on",
 )
+@pytest.mark.slow
 def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

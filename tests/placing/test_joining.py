@@ -83,6 +83,7 @@ def error_of_centres(model: pycolmap.Reconstruction, phases: dict[str, float]) -
     "each of ten photos or more has a camera; those whose focal lengths are within 1 % are joined, and photos that are "
     "added keep their folder's camera",
 )
+@pytest.mark.slow
 def test_folders_of_two_lenses_keep_two_cameras_and_one_that_is_added_finds_its_own(tmp_path: Path):
     phases = {"cam0": 0.0, "cam1": 0.04}
     source = tmp_path / "photos"

@@ -106,6 +106,7 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
 @pytest.mark.hard_case(
     "a 360° video", "its frames are cut like panoramas, and views that look the same way are matched"
 )
+@pytest.mark.slow
 def test_a_video_of_panoramas_becomes_views(panoramas: list[Image.Image], tmp_path: Path):
     with av.open(str(tmp_path / "film.mp4"), "w") as film:
         stream = film.add_stream("libx264", rate=10, options={"crf": "14"})

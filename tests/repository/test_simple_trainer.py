@@ -78,6 +78,7 @@ def test_the_loop_runs_and_splits(calls: list[int]):
         assert parameter.isfinite().all()
 
 
+@pytest.mark.slow
 def test_the_program_learns_its_photos(calls: list[int], capsys: pytest.CaptureFixture[str]):
     torch.manual_seed(0)
     untrained = simple_trainer.main("cpu", 48, 36, iterations=1)

@@ -70,6 +70,7 @@ def training_stops() -> np.ndarray:
     return stops - np.median(stops)
 
 
+@pytest.mark.slow
 def test_photos_of_two_exposures_train_to_the_median_exposure(exposed: Path, tmp_path: Path, monkeypatch: Any):
     monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))  # Its weights would be downloaded.
     measured = {}
