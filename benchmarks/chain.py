@@ -14,7 +14,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
-import os
 import subprocess
 import sys
 import time
@@ -26,7 +25,7 @@ from typing import Any
 from benchmarks import results
 from benchmarks.chain_table import markdown
 from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, photos_of, write_row, written_row
-from benchmarks.side_by_side import environment_of
+from benchmarks.side_by_side import environment_of, run_program
 
 INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
 LOADER = (
@@ -101,23 +100,12 @@ def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
 
     Raises subprocess.CalledProcessError if a command fails; its output is in `work/log`.
     """
-    environment = environment_of(None)
-    if site is not None:
-        environment["PYTHONPATH"] = os.pathsep.join([str(site), environment["PYTHONPATH"]])
+    environment = environment_of(None, site)
     seconds: dict[str, float] = {}
 
     def call(stage: str, *words: str) -> None:
         begin = time.perf_counter()
-        with (work / "log").open("ab") as log:
-            subprocess.run(
-                [sys.executable, "-c", LOADER, *words],
-                cwd=work,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                check=True,
-            )
+        run_program(LOADER, words, work, environment)
         seconds[stage] = round(time.perf_counter() - begin, 2)
 
     scene = work / "scene"

@@ -11,7 +11,6 @@ memory. With `--cold` kernels are compiled again in each run.
 from __future__ import annotations
 
 import json
-import os
 import resource
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, 
 from benchmarks.plots import save
 from benchmarks.run import software
 from benchmarks.seconds_table import Part, markdown
-from benchmarks.side_by_side import environment_of
+from benchmarks.side_by_side import environment_of, run_program
 from sadgs_ns.events import TRACE
 
 PROGRAMS = {"sadgs": "sadgs_ns.cli.sadgs", "sadgs-process": "sadgs_ns.cli.process"}
@@ -130,9 +129,7 @@ def measure(run: Run, work: Path) -> dict[str, Any]:
         photos = link_photos(photos, run.every, work / "photos")
     trace = work / "trace"
     trace.touch()
-    environment = {**environment_of(None), TRACE: str(trace)}
-    if run.site:
-        environment["PYTHONPATH"] = os.pathsep.join([run.site, environment["PYTHONPATH"]])
+    environment = {**environment_of(None, run.site), TRACE: str(trace)}
     if run.is_cold:
         for variable in _CACHES:
             environment[variable] = str(work / variable)
@@ -140,19 +137,10 @@ def measure(run: Run, work: Path) -> dict[str, Any]:
     words = [str(photos), str(work / "out"), *run.words]
     if run.program == "sadgs":
         words.insert(1, "--output")
-    with (work / "log").open("wb") as log:
-        start = time.time()
-        begin = time.perf_counter()
-        subprocess.run(
-            [sys.executable, "-c", code, *words],
-            cwd=work,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            check=True,
-        )
-        seconds = time.perf_counter() - begin
+    start = time.time()
+    begin = time.perf_counter()
+    run_program(code, words, work, environment)
+    seconds = time.perf_counter() - begin
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     parts = parts_of(trace.read_text("utf8").splitlines(), run.program, start)
     rounded = [[part.process, part.name, round(part.begin, 3), round(part.end, 3)] for part in parts]

@@ -28,9 +28,14 @@ def devices_of(gpu: str | None) -> list[str]:
     return [] if gpu is None else gpu.split("+")
 
 
-def environment_of(gpu: str | None) -> dict[str, str]:
-    """Return the environment of a process that imports from this checkout, wherever it starts, and sees these GPUs."""
+def environment_of(gpu: str | None, site: str | Path | None = None) -> dict[str, str]:
+    """Return the environment of a process that imports from this checkout, wherever it starts, and sees these GPUs.
+
+    With `site` it imports from that folder first, as of another version of the package.
+    """
     paths = [str(Path(__file__).resolve().parents[1])]
+    if site:
+        paths.insert(0, str(site))
     before = os.environ.get("PYTHONPATH")
     if before:
         paths.append(before)
@@ -38,6 +43,26 @@ def environment_of(gpu: str | None) -> dict[str, str]:
     if gpu is not None:
         environment["CUDA_VISIBLE_DEVICES"] = ",".join(devices_of(gpu))
     return environment
+
+
+def run_program(
+    code: str, words: Sequence[str], work: Path, environment: dict[str, str], timeout: float | None = None
+) -> None:
+    """Run Python code with arguments in a folder, and append what it prints to `log` there.
+
+    Raises subprocess.CalledProcessError if it fails, and TimeoutExpired after so many seconds.
+    """
+    with (work / "log").open("ab") as log:
+        subprocess.run(
+            [sys.executable, "-c", code, *words],
+            cwd=work,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            check=True,
+            timeout=timeout,
+        )
 
 
 def run_side_by_side(

@@ -23,7 +23,7 @@ from typing import Any
 from benchmarks import results
 from benchmarks.chain import now
 from benchmarks.seconds import about
-from benchmarks.side_by_side import environment_of
+from benchmarks.side_by_side import environment_of, run_program
 from benchmarks.table import grid
 from sadgs_ns.events import TRACE
 
@@ -81,19 +81,9 @@ def measure(way: Way, data: Path, iterations: int, work: Path, caches: Path) -> 
         environment[variable] = str(caches / variable)
     words = ["sadgs", "--data", str(data), "--output-dir", str(work / "out"), "--vis", "none"]
     words += ["--max-num-iterations", str(iterations)]
-    with (work / "log").open("wb") as log:
-        start = time.time()
-        subprocess.run(
-            [sys.executable, "-c", way.code, *words],
-            cwd=work,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            check=True,
-            timeout=_LONGEST,
-        )
-        end = time.time()
+    start = time.time()
+    run_program(way.code, words, work, environment, _LONGEST)
+    end = time.time()
     events = [json.loads(text) for text in trace.read_text("utf8").splitlines()]
     times = {event["event"]: event["time"] for event in events}
     seconds = {
