@@ -26,6 +26,7 @@ from sadgs_ns.kernels.shared import (
     load3,
     load_intrinsics,
     load_viewmat,
+    projection_rows,
     rotation,
     store3,
     unit_quaternion,
@@ -126,12 +127,9 @@ def _project_backward(
         slope_y = clamped(y * inverse, fy, cy, height)
         jx = fx * inverse
         jy = fy * inverse
-        t00 = jx * (w00 - slope_x * w20)
-        t01 = jx * (w01 - slope_x * w21)
-        t02 = jx * (w02 - slope_x * w22)
-        t10 = jy * (w10 - slope_y * w20)
-        t11 = jy * (w11 - slope_y * w21)
-        t12 = jy * (w12 - slope_y * w22)
+        t00, t01, t02, t10, t11, t12 = projection_rows(
+            slope_x, slope_y, jx, jy, w00, w01, w02, w10, w11, w12, w20, w21, w22
+        )
         k00, k01, k02 = h00 * t00 + h01 * t10, h00 * t01 + h01 * t11, h00 * t02 + h01 * t12  # H T
         k10, k11, k12 = h01 * t00 + h11 * t10, h01 * t01 + h11 * t11, h01 * t02 + h11 * t12
         v_xx += tl.where(seen, t00 * k00 + t10 * k10, 0.0)

@@ -21,7 +21,16 @@ from torch import Tensor
 from sadgs_ns import gsplat_compat
 from sadgs_ns.gsplat_compat import FAR_PLANE, NEAR_PLANE, SCREEN_BLUR
 from sadgs_ns.kernels import cdiv
-from sadgs_ns.kernels.shared import clamped, load3, load_intrinsics, load_viewmat, rotation, store3, unit_quaternion
+from sadgs_ns.kernels.shared import (
+    clamped,
+    load3,
+    load_intrinsics,
+    load_viewmat,
+    projection_rows,
+    rotation,
+    store3,
+    unit_quaternion,
+)
 
 _LANES = 128  # Gaussians that one program handles
 _LARGEST = tl.constexpr(1e9)  # Radius in px that int32 holds
@@ -84,12 +93,7 @@ def _project_forward(
         slope_y = clamped(ratio_y, fy, cy, height)
         jx = fx * inverse
         jy = fy * inverse
-        x0 = jx * (w00 - slope_x * w20)
-        x1 = jx * (w01 - slope_x * w21)
-        x2 = jx * (w02 - slope_x * w22)
-        y0 = jy * (w10 - slope_y * w20)
-        y1 = jy * (w11 - slope_y * w21)
-        y2 = jy * (w12 - slope_y * w22)
+        x0, x1, x2, y0, y1, y2 = projection_rows(slope_x, slope_y, jx, jy, w00, w01, w02, w10, w11, w12, w20, w21, w22)
         p00 = s0 * _dot(x0, x1, x2, r00, r10, r20)
         p10 = s0 * _dot(y0, y1, y2, r00, r10, r20)
         p01 = s1 * _dot(x0, x1, x2, r01, r11, r21)

@@ -93,6 +93,18 @@ def clamped(ratio, focal, centre, size):
     return tl.minimum(tl.maximum(ratio, -(centre / focal + margin)), (size - centre) / focal + margin)
 
 
+@triton.jit
+def projection_rows(slope_x, slope_y, jx, jy, w00, w01, w02, w10, w11, w12, w20, w21, w22):
+    """Return the entries of J W, row by row, of a camera's rotation W and the Jacobian J [2, 3] of the projection.
+
+    J has jx and jy, the focal lengths over the depth, and the slopes x / z and y / z where it is taken.
+    """
+    return (
+        jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22),
+        jy * (w10 - slope_y * w20), jy * (w11 - slope_y * w21), jy * (w12 - slope_y * w22),
+    )  # fmt: skip
+
+
 def equally_spaced_rows(gradient: Tensor | None, like: Tensor) -> tuple[Tensor, int]:
     """Return a gradient [C, N, D] whose rows are equally far apart, and how many numbers; zeros where there is none.
 
