@@ -20,7 +20,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from sadgs_ns.events import progress
-from sadgs_ns.placing.photos import num_cores, threads
+from sadgs_ns.host import num_cores
+from sadgs_ns.placing.photos import threads
 from sadgs_ns.placing.plan import NEIGHBORS
 from sadgs_ns.placing.verification import Verifier
 

@@ -17,7 +17,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 
 from sadgs_ns.data.images import NOT_UPRIGHT, SIDEWAYS
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.host_memory import available_host_bytes
+from sadgs_ns.host import available_host_bytes, num_cores
 from sadgs_ns.placing.bit_depth import largest_value
 from sadgs_ns.placing.colours import profile_of
 from sadgs_ns.placing.folder import COLMAP_FORMATS
@@ -123,13 +123,6 @@ def threads(number: int | None = None) -> Iterator[ThreadPoolExecutor]:
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def num_cores() -> int:
-    """Return how many cores this process may use, which may be fewer than the machine has."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def threads_in_memory(bytes_of_photo: float) -> int:

@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from sadgs_ns.events import progress
+from sadgs_ns.host import num_cores
 
 _FEWEST_CORES = 3  # The run itself keeps two busy
 _LONGEST = 60.0  # Seconds without progress after which the run no longer waits
@@ -73,7 +74,7 @@ def wait() -> None:
 def _marker() -> Path | None:
     """Return the file in Triton's cache that says that this was done, or None if it should not be; imports no torch."""
     cards = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
-    if not cards or len(os.sched_getaffinity(0)) < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
+    if not cards or num_cores() < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
         return None
     try:
         versions = f"{version('torch')} {version('triton')} {sys.version}"
@@ -140,7 +141,7 @@ def main() -> None:
     """Compile all kernels, and tell after each how many are done, and of how many; runs in the process of `begin`."""
     os.nice(5)  # The run must go on meanwhile.
     find_kernels()
-    processes = min(len(_found), len(os.sched_getaffinity(0)) - 1)
+    processes = min(len(_found), num_cores() - 1)
     with ProcessPoolExecutor(processes, get_context("fork"), _begin_compiler) as pool:
         compiled = [pool.submit(compile_kernel, index) for index in range(len(_found))]
         threading.Thread(target=_end_with_the_run, daemon=True).start()

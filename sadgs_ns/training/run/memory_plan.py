@@ -10,7 +10,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
-from sadgs_ns import host_memory
+from sadgs_ns import host
 from sadgs_ns.distributed.bands import views_of_rank
 from sadgs_ns.errors import InputError
 from sadgs_ns.method.ops import Params
@@ -91,7 +91,7 @@ def choose_image_storage(datamanager: FullImageDatamanager, device: torch.device
     """
     requested: str = datamanager.config.cache_images
     size = image_bytes(datamanager)
-    host_free = least(host_memory.available_host_bytes() / processes_on_this_machine(), device)
+    host_free = least(host.available_host_bytes() / processes_on_this_machine(), device)
     fits_host = size <= HOST_SHARE * host_free
     needs = f"decoded images and their structure take {size / 1e9:.2g} GB"
     on_host = "The images stay in the host's memory and are copied ahead of the steps"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from sadgs_ns.data.images import NO_MASK, valid_pixels
 from sadgs_ns.errors import InputError, reason
+from sadgs_ns.host import num_cores
 from sadgs_ns.training.run.processes import processes_on_this_machine
 from sadgs_ns.training.step.undistortion import Undistortion
 
@@ -29,11 +29,7 @@ _KEPT_WARPS = 4  # Cameras whose warps are kept, at 8 bytes a pixel; each image 
 
 def thread_count(requested: int | None) -> int:
     """Return the number of threads that decode images in this process; by default one per core, up to 16."""
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
-    else:
-        cores = os.cpu_count() or 1
-    return requested or min(max(cores // processes_on_this_machine(), 1), 16)
+    return requested or min(max(num_cores() // processes_on_this_machine(), 1), 16)
 
 
 def stack(tensors: Sequence[Tensor]) -> Tensor:

@@ -25,7 +25,7 @@ from nerfstudio.cameras.cameras import Cameras
 
 from examples.drawn_scene.scene import write_scene
 from helpers.kill_and_resume import configure, set_up
-from sadgs_ns import host_memory
+from sadgs_ns import host
 from sadgs_ns.errors import InputError
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method import running_strategy as strategy_module
@@ -297,7 +297,7 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     large = datamanager(10_000)
     size = image_bytes(small)
     assert size == 3 * (number + 100) * 100**2 + 3 * number * 100**2
-    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1e15)
+    monkeypatch.setattr(host, "available_host_bytes", lambda: 1e15)
 
     card(1.01 * size / share / 1e9, 80)
     assert choose_image_storage(small, gpu) == ImageStorage("gpu")
@@ -311,14 +311,14 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
     )
 
     card(80, 80)
-    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 1.99 * image_bytes(large))
+    monkeypatch.setattr(host, "available_host_bytes", lambda: 1.99 * image_bytes(large))
     for device, name in ((gpu, "GPU"), (torch.device("cpu"), "host")):
         storage = choose_image_storage(large, device)
         compressed = "The images stay compressed and are decoded ahead of the steps: decoded images and "
         assert storage.where == "compressed"
         assert storage.sentence.startswith(compressed)
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in storage.sentence
-    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 2.01 * image_bytes(large))
+    monkeypatch.setattr(host, "available_host_bytes", lambda: 2.01 * image_bytes(large))
     assert choose_image_storage(large, torch.device("cpu")) == ImageStorage("gpu")  # the training device
 
 
@@ -350,5 +350,5 @@ def test_the_host_s_memory_is_what_linux_and_a_container_leave(files: dict, expe
         path = tmp_path / (name if name.startswith("proc") else f"sys/fs/cgroup/{name}")
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    assert host_memory.available_host_bytes(tmp_path) == expected
-    assert host_memory.available_host_bytes() > 0
+    assert host.available_host_bytes(tmp_path) == expected
+    assert host.available_host_bytes() > 0

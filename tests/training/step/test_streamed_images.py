@@ -17,7 +17,7 @@ from helpers.gloo_ranks import run_ranks
 from helpers.sharded_training import STRUCTURE_EVERY, few_steps, record, set_up_together
 from helpers.short_runs import nerfstudio_data
 from helpers.small_scenes import HEIGHT, POINTS, VIEWS, WIDTH
-from sadgs_ns import host_memory
+from sadgs_ns import host
 from sadgs_ns.distributed.world import World
 from sadgs_ns.errors import InputError, RunError
 from sadgs_ns.training.config import SadgsTrainerConfig
@@ -180,7 +180,7 @@ def place_together(world: World, asked: str) -> tuple[str, str]:
     datamanager = sizes_of(10, 100)
     datamanager.config.cache_images = asked
     free = 4.1 * image_bytes(datamanager) if world.rank == 0 else 3.9 * image_bytes(datamanager)
-    pytest.MonkeyPatch().setattr(host_memory, "available_host_bytes", lambda: free)
+    pytest.MonkeyPatch().setattr(host, "available_host_bytes", lambda: free)
     storage = choose_image_storage(datamanager, torch.device("cpu"))
     return storage.where, storage.sentence
 
@@ -203,10 +203,10 @@ def test_processes_that_find_different_memory_place_their_images_alike(asked: st
 def test_decoded_images_stay_on_the_host_where_all_processes_have_room(monkeypatch: pytest.MonkeyPatch):
     datamanager = sizes_of(10, 100)
     datamanager.config.cache_images = "cpu"
-    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 4.1 * image_bytes(datamanager))
+    monkeypatch.setattr(host, "available_host_bytes", lambda: 4.1 * image_bytes(datamanager))
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
-    monkeypatch.setattr(host_memory, "available_host_bytes", lambda: 0.0)
+    monkeypatch.setattr(host, "available_host_bytes", lambda: 0.0)
     monkeypatch.setenv("WORLD_SIZE", "1")  # One process keeps them where it is told to.
     assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
 

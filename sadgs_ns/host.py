@@ -1,9 +1,10 @@
-"""How much of the host's memory is left, read without torch, whose import takes seconds."""
+"""What this process may take of its host, memory and cores, read without torch, whose import takes seconds."""
 
 from __future__ import annotations
 
 import contextlib
 import math
+import os
 from pathlib import Path
 
 _CONTROL_GROUPS = (
@@ -12,6 +13,13 @@ _CONTROL_GROUPS = (
 )
 """Files that tell a container's memory, for versions 2 and 1 of control groups: the limit, what is in use, and
 statistics, with the name of the line that counts cached files, which the system can drop."""
+
+
+def num_cores() -> int:
+    """Return how many cores this process may use, which may be fewer than the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def available_host_bytes(root: Path = Path("/")) -> float:
