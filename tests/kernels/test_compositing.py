@@ -12,9 +12,11 @@ from torch import Tensor
 
 from helpers import small_scenes
 from helpers.gsplat_like import rasterization
-from sadgs_ns import gsplat_compat
+from helpers.rendered_scene import random_scene
+from sadgs_ns import gsplat_compat, kernels
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
@@ -449,3 +451,22 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         stated = {"absgrad": 3e-4, "conics": 1e-6 / TINY**2}
     for name, error in errors[0].items():
         assert error < max(2 * errors[1][name], stated.get(name, 1e-5)), (name, error, errors[1][name])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize(("render_mode", "max_off_axis"), [("RGB", 0.0), ("RGB+ED", 0.0), ("RGB", 0.7)])
+def test_rasterization_equals_gsplats_own(monkeypatch, render_mode, max_off_axis):
+    monkeypatch.setattr(backend_gsplat, "TILE_SIZE", kernels.TILE_SIZE)  # gsplat 1.4 cuts off at borders of tiles
+    scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
+    del scene["weights"]
+    shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "absgrad": False}
+    images = [rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="triton")]
+    images.append(rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="gsplat"))
+    if max_off_axis == 0:
+        images.append(gsplat.rasterization(**scene, **shared, packed=False, tile_size=kernels.TILE_SIZE))
+    (renders, alphas, _), *others = images
+    # Rounding decides whether a Gaussian is drawn where its alpha is 1/255.
+    for expected, expected_alphas, _ in others:
+        for one, other in ((renders, expected), (alphas, expected_alphas)):
+            different = (one - other).abs() > 1e-5 * (1 + other.abs())
+            assert different.float().mean() < 1e-3
