@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import os
 import re
 import signal
@@ -21,6 +20,7 @@ from benchmarks import protocol, results, side_by_side
 from benchmarks.protocol import Job, Row, Scene, set_dotted
 from benchmarks.run import build_config, describe
 from benchmarks.table import markdown
+from helpers.json_files import write_json
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 
@@ -265,7 +265,7 @@ class FakeRunner:
         (folder / "log").write_text("what it said")
         if job.row.label in self.crashes:
             return subprocess.Popen([sys.executable, "-S", "-c", "raise SystemExit(3)"], start_new_session=True)
-        (folder / "result.json").write_text(json.dumps({"status": "ok", "error": None, "psnr": 30.0}))
+        write_json(folder / "result.json", {"status": "ok", "error": None, "psnr": 30.0})
         return subprocess.Popen(["true"], start_new_session=True)
 
 
@@ -341,7 +341,7 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
         return process
 
     fox = {"data": "fox", "dataparser": "nerfstudio-data"}
-    (tmp_path / "p.yaml").write_text(json.dumps(content(scenes={"fox": fox})))
+    write_json(tmp_path / "p.yaml", content(scenes={"fox": fox}))
     (tmp_path / "fox").mkdir()
     arguments = [str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(tmp_path / "r.jsonl")]
     before = signal.getsignal(signal.SIGTERM)
@@ -360,9 +360,7 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
 def test_runs_on_other_numbers_of_devices_are_not_mixed(
     gpus: str, there: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    (tmp_path / "p.yaml").write_text(
-        json.dumps(content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
-    )
+    write_json(tmp_path / "p.yaml", content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
     (tmp_path / "fox").mkdir()
     monkeypatch.setattr(bench, "launcher", lambda root: pytest.fail("nothing may start"))
     output = tmp_path / "r.jsonl"
@@ -370,7 +368,8 @@ def test_runs_on_other_numbers_of_devices_are_not_mixed(
     arguments = ["p.yaml", "--scenes", ".", "--output", str(output), "--gpus", gpus]
     monkeypatch.chdir(tmp_path)
     assert bench.main(arguments) == 2
-    assert f"and another --output than {output} if that has runs on others" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"and another --output than {output} if that has runs on others" in errors
 
 
 def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -397,7 +396,8 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
         ([str(CONFIGS / "demo-gate.yaml"), "--only", "["], "is not a regular expression"),
     ]:
         assert bench.main([*arguments, *options]) == 2
-        assert sentence in capsys.readouterr().err
+        errors = capsys.readouterr().err
+        assert sentence in errors
 
 
 # Table

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import random
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.testing import assert_close
 
 from benchmarks import __main__ as bench
 from benchmarks import curve, evaluate, protocol, run
@@ -27,6 +27,7 @@ from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.forked_python import HANGS
 from helpers.gsplat_like import splatted
+from helpers.json_files import read_json
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import RenderOptions
 
@@ -156,7 +157,7 @@ def test_the_curve_changes_nothing_in_the_training(runs: Runs):
         here = measured["pipeline"].get("_extra_state", {}).pop(name, None)
         there = plain["pipeline"].get("_extra_state", {}).pop(name, None)
         assert here == there
-    torch.testing.assert_close(measured, plain, rtol=0, atol=0)
+    assert_close(measured, plain, rtol=0, atol=0)
 
 
 def test_the_curve_ends_in_the_finished_run(runs: Runs):
@@ -244,7 +245,7 @@ def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
         patch.setattr(sys, "argv", commands[0][2:])
         run.main()
         assert SadgsModel.populate_modules is populate_slowly, "the run has put it back"
-    return json.loads((folder / "result.json").read_text())
+    return read_json(folder / "result.json")
 
 
 def test_a_record_holds_all_fields(written: dict[str, Any]):
@@ -302,7 +303,7 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     }
     with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
         assert process.wait(HANGS) == 0, (tmp_path / "log").read_text()
-    record = json.loads((tmp_path / "result.json").read_text())
+    record = read_json(tmp_path / "result.json")
     assert record["status"] == "ok"
     assert record["devices"] == 2
     assert record["iterations"] == ITERATIONS

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import shutil
@@ -17,6 +16,7 @@ from PIL import Image
 from benchmarks import __main__ as benchmarks
 from benchmarks import captures, chain, protocol
 from benchmarks.capture_digests import measure_model, measure_photos
+from helpers.json_files import write_json
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 CAMERAS = ["1 PINHOLE 8 6 10 10 4 3", "2 SIMPLE_RADIAL 8 6 9 4 3 0.01"]
@@ -94,14 +94,15 @@ def test_the_order_of_frames_in_a_transforms_file_does_not_matter_and_their_list
     content = {"fl_x": 10.0, "train_filenames": ["images/a.png"], "val_filenames": ["images/b.png"]}
     models = []
     for change in ({"frames": frames}, {"frames": frames[::-1]}, {"frames": frames, "val_filenames": ["images/a.png"]}):
-        (tmp_path / "transforms.json").write_text(json.dumps({**content, **change}))
+        write_json(tmp_path / "transforms.json", {**content, **change})
         models.append(measure_model(tmp_path))
     assert models[0] == models[1] != models[2]
 
 
 def test_what_matches_is_told_to_match(scene: Path, described: Path, capsys: pytest.CaptureFixture[str]):
     assert run("--captures", described, "--check", scene.parent, "--check-photos", scene) == 0
-    assert capsys.readouterr().out == "kitchen: matches\nimages: matches\n"
+    printed = capsys.readouterr().out
+    assert printed == "kitchen: matches\nimages: matches\n"
 
 
 def move_points(scene: Path) -> None:
@@ -140,7 +141,8 @@ def test_a_capture_that_is_asked_for_by_name_must_be_there(
     checked = ("--captures", described, "--check", scene.parent)
     assert run(*checked) == 0
     assert run("kitchen", "garden", *checked) == 1
-    assert capsys.readouterr().out == 2 * f"kitchen: matches\nNot in {scene.parent}: garden\n"
+    printed = capsys.readouterr().out
+    assert printed == 2 * f"kitchen: matches\nNot in {scene.parent}: garden\n"
 
 
 @pytest.mark.parametrize(
@@ -156,14 +158,16 @@ def test_a_wrong_name_or_folder_is_refused(
 ):
     root = str(scene.parent)
     assert run(*(word.replace("ROOT", root) for word in words), "--captures", described) == 2
-    assert sentence.replace("ROOT", root) in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert sentence.replace("ROOT", root) in errors
 
 
 @pytest.mark.parametrize("text", ["scenes: {}", "- fox", "scenes: {fox: {}}\nphotos: {}", "{", "scenes: {fox: 3}"])
 def test_a_file_that_describes_no_captures_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "captures.yaml").write_text(text)
     assert run("--captures", tmp_path / "captures.yaml") == 2
-    assert "must be YAML with scenes and photos: " in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "must be YAML with scenes and photos: " in errors
 
 
 def test_every_capture_is_described_with_source_licence_and_a_command(capsys: pytest.CaptureFixture[str]):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import filecmp
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from numpy.testing import assert_array_equal
 from PIL import Image, ImageDraw
 
 from benchmarks import __main__ as bench
@@ -23,6 +23,7 @@ from benchmarks.photo_captures import photos_of
 from benchmarks.run import build_config
 from benchmarks.validation import SPARSE
 from examples.drawn_scene.scene import write_scene
+from helpers.json_files import read_json
 from sadgs_ns.data.images import NO_MASK
 from sadgs_ns.data.own_parsers import OWN
 
@@ -47,7 +48,7 @@ def pixels(path: Path) -> Pixels:
 
 
 def disturbed_photos(copy: Path) -> dict[str, dict[str, Any]]:
-    return json.loads((copy / FILE).read_text())["photos"]
+    return read_json(copy / FILE)["photos"]
 
 
 def names_in_list(copy: Path, split: str) -> list[str]:
@@ -119,7 +120,7 @@ def test_masks_are_white_exactly_where_a_photo_is_as_it_was(scene: Path, copy: P
     for name, photo in disturbed_photos(copy).items():
         differs = (pixels(scene / "images" / name) != pixels(copy / "disturbed" / name)).any(axis=-1)
         mask = pixels((copy / "true_masks" / name).with_suffix(".png"))
-        np.testing.assert_array_equal(mask, np.where(differs, 0, 255))
+        assert_array_equal(mask, np.where(differs, 0, 255))
         assert 0.03 <= differs.mean() <= 0.15
         assert photo["share"] == pytest.approx(differs.mean(), abs=1e-4)
         assert 1 <= len(photo["things"]) <= 3
@@ -133,7 +134,7 @@ def test_each_photo_has_one_to_three_things_that_cover_3_to_15_percent_of_it():
     for seed in range(60):
         result, covered, names = disturb(photo, things, np.random.default_rng(seed))
         expected = (result != photo).any(axis=-1)
-        np.testing.assert_array_equal(covered, expected)
+        assert_array_equal(covered, expected)
         numbers.add(len(names))
         shares.append(covered.mean())
     assert numbers == {1, 2, 3}
@@ -147,7 +148,7 @@ def test_a_thing_of_the_photo_s_own_colour_still_makes_a_difference(level: int):
     thing = CutOut("plain", np.dstack([np.full((20, 20, 3), level, np.uint8), np.full((20, 20), 255, np.uint8)]))
     result, covered, _ = disturb(photo, [thing], np.random.default_rng(0))
     difference = np.abs(result.astype(int) - photo).sum(axis=-1)
-    np.testing.assert_array_equal(difference, covered.astype(int))
+    assert_array_equal(difference, covered.astype(int))
 
 
 def test_a_thing_keeps_its_colour_and_fades_at_its_edge_alone():

@@ -174,7 +174,8 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
     capsys.readouterr()
     assert bench.main(["documents", str(folder), "--check"]) == 1
     assert path.read_bytes() == written
-    assert f"{path} is not what its rows give; run python -m benchmarks documents." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{path} is not what its rows give; run python -m benchmarks documents." in printed
     assert bench.main(["documents", str(folder)]) == 0
     assert path.read_bytes() != written
     assert digest is not None
@@ -221,10 +222,8 @@ def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pyt
     wrong = readme.read_text("utf8").replace("29.00", "28.99")
     readme.write_text(wrong, "utf8")
     assert bench.main(["documents", str(folder), "--check"]) == 1
-    assert (
-        capsys.readouterr().out
-        == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
-    )
+    printed = capsys.readouterr().out
+    assert printed == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
     assert readme.read_text("utf8") == wrong
 
 
@@ -269,7 +268,8 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
 def test_rows_that_no_table_cites_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS}, ROWS)
     assert bench.main(["documents", str(folder)]) == 2
-    assert "no table is made of sweep.jsonl" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "no table is made of sweep.jsonl" in errors
 
 
 def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -277,9 +277,11 @@ def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.
     readme = folder / "README.md"
     readme.write_text(readme.read_text("utf8").replace(f"{OPENING.format('sweep')}\n{CLOSING}", ""), "utf8")
     assert bench.main(["documents", str(folder)]) == 2
-    assert "no document holds sweep" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "no document holds sweep" in errors
 
 
 def test_a_folder_that_is_no_checkout_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert bench.main(["documents", str(tmp_path)]) == 2
-    assert "give a checkout's folder" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "give a checkout's folder" in errors

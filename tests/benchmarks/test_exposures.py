@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from PIL import Image
 
 from benchmarks import __main__ as bench
 from benchmarks.exposures import FILE, draw_gains, linear_light, srgb_values, with_gains
+from helpers.json_files import read_json
 from helpers.small_scenes import VIEWS
 
 
@@ -20,7 +21,7 @@ def pixels(scene: Path, name: str) -> np.ndarray:
 
 def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_the_mean(scene: Path, tmp_path: Path):
     assert bench.main(["exposures", str(scene), str(tmp_path / "copy")]) == 0
-    photos = json.loads((tmp_path / "copy" / FILE).read_text())
+    photos = read_json(tmp_path / "copy" / FILE)
     assert len(photos) == VIEWS
     assert (tmp_path / "copy" / "sparse" / "0" / "points3D.bin").exists()
     held_out = [name for name, photo in photos.items() if photo["held_out"]]
@@ -29,12 +30,12 @@ def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_t
     assert gains.max() / gains.min() == pytest.approx(4.0)
     actual = [photos[name]["gain"] for name in held_out]
     expected = np.exp(np.log(gains).mean())
-    np.testing.assert_allclose(actual, expected)
+    assert_allclose(actual, expected)
     for name, photo in photos.items():
         before = linear_light(pixels(scene, name) / 255.0)
         after = linear_light(pixels((tmp_path / "copy"), name) / 255.0)
         gain = photo["gain"] * np.array(photo["channels"])
-        np.testing.assert_allclose(after, before * gain, atol=0.005)  # half a step of 8 bits
+        assert_allclose(after, before * gain, atol=0.005)  # half a step of 8 bits
         assert photo["held_out"] == (photo["channels"] == [1.0, 1.0, 1.0])
         assert gain.max() <= 1
 
@@ -43,7 +44,7 @@ def test_a_control_has_one_exposure(scene: Path, tmp_path: Path):
     options = ["--spread", "1", "--white-balance", "0", "--mean", "0.5"]
     status = bench.main(["exposures", str(scene), str(tmp_path / "copy"), *options])
     assert status == 0
-    photos = json.loads((tmp_path / "copy" / FILE).read_text()).values()
+    photos = read_json(tmp_path / "copy" / FILE).values()
     actual = {(photo["gain"], *photo["channels"]) for photo in photos}
     expected = {(0.5, 1.0, 1.0, 1.0)}
     assert actual == expected
@@ -56,7 +57,7 @@ def test_the_same_seed_draws_the_same_gains():
 
 def test_factors_of_channels_keep_the_brightness_and_stay_in_their_range():
     gains, factors = draw_gains(500, 4.0, 0.1, 0.4, seed=3)
-    np.testing.assert_allclose(factors.prod(axis=1), 1.0)
+    assert_allclose(factors.prod(axis=1), 1.0)
     assert 1.05 < factors.max() <= 1.1 + 1e-9
     assert 1 / 1.1 - 1e-9 <= factors.min() < 0.95
     assert np.exp(np.log(gains).mean()) == pytest.approx(0.4)
@@ -64,7 +65,7 @@ def test_factors_of_channels_keep_the_brightness_and_stay_in_their_range():
 
 def test_srgb_and_linear_light_are_inverse():
     values = np.linspace(0, 1, 1001)
-    np.testing.assert_allclose(srgb_values(linear_light(values)), values, atol=1e-7)
+    assert_allclose(srgb_values(linear_light(values)), values, atol=1e-7)
 
 
 def test_what_exceeds_white_saturates():

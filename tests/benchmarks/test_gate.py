@@ -16,6 +16,7 @@ from benchmarks import __main__ as bench
 from benchmarks import gate, protocol, side_by_side
 from benchmarks.gate import Metric
 from benchmarks.protocol import Job, Row, Scene
+from helpers.json_files import write_json
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
 BASELINES = sorted(path.stem for path in CONFIGS.glob("baselines/*.json"))
@@ -38,7 +39,7 @@ def baseline(tmp_path: Path) -> Path:
     path = tmp_path / "baseline.json"
     psnr = entry(30.0, "higher", 0.5)
     count = entry(1000, "near", 50)
-    path.write_text(json.dumps({"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}}))
+    write_json(path, {"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}})
     return path
 
 
@@ -122,7 +123,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "fox").mkdir()
     scene = {"data": "fox", "dataparser": "nerfstudio-data"}
     content = {"scenes": {"fox": scene}, "seeds": [0], "rows": [{"label": "ours", "method": "sadgs"}]}
-    (tmp_path / "p.yaml").write_text(json.dumps(content))
+    write_json(tmp_path / "p.yaml", content)
     monkeypatch.setattr(side_by_side, "POLL_SECONDS", 0.01)
     started: list[str] = []
 
@@ -131,7 +132,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
         def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
             started.append(job.key)
-            (folder / "result.json").write_text(json.dumps(result(job, **times, **measured)))
+            write_json(folder / "result.json", result(job, **times, **measured))
             return subprocess.Popen(["true"], start_new_session=True)
 
         monkeypatch.setattr(bench, "launcher", lambda root: launch)
@@ -144,7 +145,8 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 def test_the_command_exits_with_1_on_a_regression(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
     assert command("--gate", str(baseline), psnr=29.6) == 0
-    assert f"Gate: passed, 3 metrics of 1 rows in {baseline}." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"Gate: passed, 3 metrics of 1 rows in {baseline}." in printed
     assert command("--gate", str(baseline), psnr=29.4) == 1
     said = capsys.readouterr().out
     assert "Gate: fox/ours: psnr moved by -0.6, from 30 to 29.4; tolerance 0.5 (higher is better)." in said
@@ -163,7 +165,8 @@ def test_a_wrong_baseline_is_told_before_anything_runs(
     command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert command("--gate", str(baseline.with_name("no.json"))) == 2
-    assert "no.json is no baseline ([Errno 2] No such file" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "no.json is no baseline ([Errno 2] No such file" in errors
     assert not command.started
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from benchmarks import __main__ as bench
 from benchmarks import kernel_loops, kernel_share, kernel_table, kernel_twins, results
@@ -18,6 +19,7 @@ from benchmarks.kernel_loops import REFERENCE, Measured, Phase, Rounds, State, p
 from benchmarks.kernel_share import Loop, Part
 from benchmarks.kernel_twins import ALL, TWINS, Twin, replaced
 from benchmarks.protocol import Job, Row, Scene
+from helpers.generators import seeded
 from helpers.gsplat_stub import stub_gsplat
 from helpers.interpreted_rasterizer import use_our_rasterizer
 from helpers.kill_and_resume import differences, set_up
@@ -57,7 +59,7 @@ def test_a_twin_stands_in_a_kernel_s_place_only_meanwhile(name: str):
 
 def test_adam_s_twin_updates_as_the_kernel():
     adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     shapes = [(20, 3), (20, 15, 3), (20, 1)]
     start = [torch.randn((4, *shape), generator=generator).to(DEVICE) for shape in shapes]
     start[1][1, 3] = torch.nan  # A gradient
@@ -73,7 +75,7 @@ def test_adam_s_twin_updates_as_the_kernel():
         assert flag.isnan()
         found.append([*parameters, *means, *squares])
     for ours, theirs in zip(*found, strict=True):
-        torch.testing.assert_close(theirs, ours, rtol=1e-4, atol=1e-6)
+        assert_close(theirs, ours, rtol=1e-4, atol=1e-6)
     assert not torch.equal(found[0][0], start[0][0])
 
 
@@ -341,7 +343,8 @@ def test_the_command_writes_a_row_for_each_kernel(
     assert rows[1]["replayed"] == {"densification": 0, "after": 0}
     assert {*rows[1]["ms"]} == {"densification", "after"}
     assert {*rows[3]["ms"]} == {"densification"}
-    assert "| poses | torch |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| poses | torch |" in printed
 
 
 @pytest.mark.parametrize(
@@ -358,5 +361,6 @@ def test_unknown_names_are_refused_in_a_sentence(
     Path("mine.yaml").write_text(PROTOCOL)
     given = ["kernels", "mine.yaml", "--scenes", ".", "--output", "rows.jsonl", *words]
     assert bench.main(given) == 2
-    assert f"python -m benchmarks kernels: {sentence}" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"python -m benchmarks kernels: {sentence}" in errors
     assert not Path("rows.jsonl").exists()

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from benchmarks import __main__ as bench
@@ -92,6 +93,6 @@ def test_evidence_of_a_run_is_drawn(scene: Path, tmp_path: Path, capsys: pytest.
     with Image.open(drawn[0]) as picture, Image.open(scene / "images" / "001.png") as photo:
         assert picture.size == (3 * photo.width, 2 * photo.height)
         corner = picture.convert("RGB").crop((0, 0, photo.width, photo.height))
-        np.testing.assert_array_equal(np.asarray(corner), np.asarray(photo.convert("RGB")))
+        assert_array_equal(np.asarray(corner), np.asarray(photo.convert("RGB")))
     output = capsys.readouterr().out
     assert "deviation" in output and "001.png: 0.0% found" in output

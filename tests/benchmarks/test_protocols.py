@@ -286,7 +286,8 @@ def test_all_missing_scenes_are_one_sentence_with_their_source(tmp_path: Path):
 def test_another_order_of_the_images_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     colmap_scene(tmp_path / "garden", names=("b.jpg", "a.jpg"))
     check([job()], tmp_path)
-    assert "scene 'garden': COLMAP numbered its images in another order" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "scene 'garden': COLMAP numbered its images in another order" in errors
 
 
 def test_the_command_says_what_is_missing_before_it_runs_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

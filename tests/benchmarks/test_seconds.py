@@ -112,7 +112,8 @@ def test_the_parts_of_a_command_are_measured_once(tmp_path: Path, capsys: pytest
     written = (tmp_path / "rows.jsonl").read_bytes()
     assert measure() == 0  # There is nothing left to do.
     assert (tmp_path / "rows.jsonl").read_bytes() == written
-    assert "| corner | new | COLMAP | features |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| corner | new | COLMAP | features |" in printed
 
 
 def test_a_command_that_fails_has_a_row_and_its_output_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

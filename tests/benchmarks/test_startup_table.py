@@ -55,7 +55,8 @@ def test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones(
     assert started[0]["cache"] not in caches
     for run in started:
         assert "--max-num-iterations 9" in " ".join(run["words"])
-    assert "| sadgs without compile_ahead | " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| sadgs without compile_ahead | " in printed
 
 
 def test_a_run_that_fails_has_a_row_that_says_so(started: list[dict[str, Any]], tmp_path: Path):
@@ -80,7 +81,8 @@ def test_wrong_names_are_refused_in_a_sentence(
 ):
     monkeypatch.chdir(tmp_path)
     assert bench.main(["startup", "--output", "rows.jsonl", *words]) == 2
-    assert f"python -m benchmarks startup: {sentence}" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"python -m benchmarks startup: {sentence}" in errors
     assert list(tmp_path.iterdir()) == []
 
 

@@ -124,7 +124,8 @@ def test_the_printed_table_pools_the_seeds_of_all_scenes(tmp_path: Path, capsys:
     rows = [result(scene, seed=seed) for scene in ("fox", "south") for seed in (0, 1)]
     assert bench.main(["table", write_lines(tmp_path / "r.jsonl", rows)]) == 0
     told = "- ours: pooled standard deviation .71 / .0000 / .0000 of PSNR, SSIM and LPIPS over 2 scenes.\n"
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
 
 
 def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -134,7 +135,8 @@ def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFi
     for rows in ([result(lpips=None, gpu=None, peak_gb=None), bare], [least]):
         lines = write_lines(tmp_path / "r.jsonl", rows)
         assert bench.main(["table", lines, "--plots", str(tmp_path / "out")]) == 0
-        assert "| bare | " in capsys.readouterr().out
+        printed = capsys.readouterr().out
+        assert "| bare | " in printed
 
 
 @pytest.mark.parametrize(

@@ -32,8 +32,9 @@ def test_spread_worst_view_and_losses_of_each_label(tmp_path: Path, capsys: pyte
     fold = [row("ours", 0, [25.0], "fox-2"), row("ours", 1, [21.0], "fox-2")]
     files = [write(tmp_path / "1.jsonl", *BASE), write(tmp_path / "2.jsonl", *OURS, *fold)]
     assert bench.main(["views", *files]) == 0
+    printed = capsys.readouterr().out
     assert (
-        capsys.readouterr().out
+        printed
         == """## fox
 
 | View | Angle ° | base | ours |

@@ -117,12 +117,14 @@ def test_a_run_is_told_from_a_capture(given: str, tmp_path: Path, capsys: pytest
     (run / "nerfstudio_models").mkdir(parents=True)
     (run / "config.yml").touch()
     assert doctor.main([str(run / given)]) == 1
-    assert "is a run" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "is a run" not in printed
     (run / "nerfstudio_models" / "step-000000007.ckpt").touch()
     assert doctor.main([str(run / given)]) == 1
     config = f"'{run}/config.yml'"
     shown = f"`ns-viewer --load-config {config}` shows it, and `sadgs-export {config} --output splat.ply` exports it."
-    assert capsys.readouterr().out.splitlines()[-1] == f"error: {run / given} is a run and no capture: {shown}"
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == f"error: {run / given} is a run and no capture: {shown}"
 
 
 @pytest.mark.parametrize(("severity", "code"), [("note", 0), ("warning", 0), ("error", 1)])
@@ -131,7 +133,8 @@ def test_only_an_error_makes_the_exit_code_1(
 ):
     monkeypatch.setattr(doctor, "check_machine", lambda: iter([Finding(severity, "Something is so.")]))
     assert doctor.main([]) == code
-    assert f"{severity}: Something is so." in capsys.readouterr().out.splitlines()
+    printed = capsys.readouterr().out
+    assert f"{severity}: Something is so." in printed.splitlines()
 
 
 def test_a_missing_package_is_called_missing(monkeypatch: pytest.MonkeyPatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from nerfstudio.data.dataparsers.dnerf_dataparser import DNeRFDataParserConfig
 from nerfstudio.data.dataparsers.nerfosr_dataparser import NeRFOSRDataParserConfig
 from PIL import Image
 
+from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import blender_data, configure, frames, is_finite, train
 from helpers.small_scenes import HEIGHT, WIDTH
@@ -52,10 +52,10 @@ def moving_scene(folder: Path, times: list[float]) -> None:
     """Write a scene as D-NeRF has them."""
     blender_data(folder, "white")
     for path in folder.glob("transforms_*.json"):
-        content = json.loads(path.read_text())
+        content = read_json(path)
         for frame, time in zip(content["frames"], 5 * times, strict=False):
             frame["time"] = time
-        path.write_text(json.dumps(content))
+        write_json(path, content)
 
 
 @pytest.mark.hard_case("`dnerf-data`, whose frames have a `time`", "trains as one moment, with a warning")

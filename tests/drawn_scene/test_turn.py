@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from numpy.testing import assert_allclose
 from PIL import Image
 
 from examples import gallery_page, turn
@@ -24,8 +25,8 @@ TARGET = np.array([0.5, 1.0, 0.3])
 def test_the_camera_looks_at_the_point_from_the_same_distance_all_along_and_ends_where_it_began():
     poses = turn.ellipse(POSE, TARGET, math.radians(25), math.radians(8), frames=16)
     towards = TARGET - poses[:, :, 3]
-    np.testing.assert_allclose(np.linalg.norm(towards, axis=1), 3.0, atol=1e-12)
-    np.testing.assert_allclose(-poses[:, :, 2], towards / 3, atol=1e-12)
+    assert_allclose(np.linalg.norm(towards, axis=1), 3.0, atol=1e-12)
+    assert_allclose(-poses[:, :, 2], towards / 3, atol=1e-12)
     steps = np.linalg.norm(poses[:, :, 3] - np.roll(poses[:, :, 3], 1, axis=0), axis=1)
     assert steps.max() < 0.6 and steps.min() > 0
 
@@ -91,15 +92,16 @@ def test_wrong_input_is_refused_in_a_sentence(
 ):
     monkeypatch.chdir(tmp_path)
     assert turn.main(["run", *words]) == 2
-    assert sentence in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert sentence in errors
     assert not list(tmp_path.iterdir())
 
 
 def test_the_gallery_s_page_begins_at_the_drawn_scene_s_first_camera():
     view = arc_views(9, 320, 240)[0]
-    np.testing.assert_allclose(gallery_page.START.position, view.position, atol=1e-3)
+    assert_allclose(gallery_page.START.position, view.position, atol=1e-3)
     forward = np.subtract(gallery_page.START.target, view.position)
-    np.testing.assert_allclose(forward / np.linalg.norm(forward), view.rotation[2], atol=1e-3)
+    assert_allclose(forward / np.linalg.norm(forward), view.rotation[2], atol=1e-3)
     assert math.tan(math.radians(gallery_page.START.degrees) / 2) == pytest.approx(
         view.width / 2 / view.focal, abs=1e-3
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from helpers.fake_node import put_node_into_path
+from helpers.json_files import read_json
 from sadgs_ns.cli.sadgs_options import choose_formats
 from sadgs_ns.formats import page_writer
 
@@ -31,9 +31,9 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_the_lock_file_pins_every_package_by_its_hash_and_names_no_server():
-    lock = json.loads((page_writer.PACKAGES / "package-lock.json").read_text())
+    lock = read_json(page_writer.PACKAGES / "package-lock.json")
     packages = {name: package for name, package in lock["packages"].items() if name}
-    wanted = json.loads((page_writer.PACKAGES / "package.json").read_text())["dependencies"]
+    wanted = read_json(page_writer.PACKAGES / "package.json")["dependencies"]
     assert lock["packages"][""]["dependencies"] == wanted
     assert str(page_writer.PROGRAM).split("/bin/")[0] in packages
     for package in packages.values():

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.generators import seeded
 from sadgs_ns.geometry.camera_paths import HAZE_LENGTH, REACH, SUPPORT, TOO_WIDE, CameraPaths
 from sadgs_ns.method.running_strategy import empty_state
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -96,7 +97,7 @@ def test_haze_near_surfaces_is_found():
 def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
     views: int, width: float, near: float, monkeypatch: pytest.MonkeyPatch
 ):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     viewmats = row_of_cameras(views)
     viewmats[:, 1:3, 3] = torch.rand((views, 2), generator=generator)
     size = torch.tensor([2 * views + 6.0, width, width])
@@ -118,7 +119,7 @@ def test_random_gaussians_are_found_as_a_loop_in_float64_finds_them(
 
 @pytest.mark.parametrize("factor", [1e-3, 1e4])
 def test_a_scene_in_other_units_has_the_same_haze(factor: float):
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     viewmats = row_of_cameras()
     points = wall(4.0)
     means = 12 * torch.rand((500, 3), generator=generator) - torch.tensor([1.0, 6.0, 6.0])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.geometry import near_plane
 from sadgs_ns.geometry.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
 from sadgs_ns.render.rasterization import rasterize
@@ -86,8 +88,8 @@ def test_where_no_camera_sees_enough_points_the_cameras_extent_decides(points: T
 
 def test_turned_cameras_measure_along_their_own_axes():
     """Cameras around a ball of points: the nearest of them lie a radius before its middle."""
-    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=seeded(0)), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=seeded(1)), dim=1)
     _, Ks, sizes = row_of_cameras(20)
     viewmats = looking_at_the_origin(4.0 * directions)
     assert scene_near_plane(points, viewmats, Ks, sizes) == pytest.approx(3.0 * NEAR_SHARE, rel=0.01)
@@ -123,4 +125,4 @@ def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_
 
     clean = draw(1, 0.01)
     assert (draw(2, 0.01) - clean).abs().mean() > 0.1
-    torch.testing.assert_close(draw(2, 4.0), clean)
+    assert_close(draw(2, 4.0), clean)

@@ -17,8 +17,11 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
 from torch import Tensor
+from torch.testing import assert_close
 
 from helpers import small_scenes
+from helpers.closeness import assert_within, assert_within_peak
+from helpers.generators import seeded
 from helpers.gsplat_like import rasterization
 from helpers.rendered_scene import random_scene
 from sadgs_ns import kernels
@@ -59,7 +62,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch, module: Any, *names: str) -> list[
 @pytest.mark.hard_case("pixels where both images agree", "L1 has a kink there; its gradient is 0, as torch's")
 @pytest.mark.parametrize("shape", [(2, 21, 47, 3), (1, 11, 11, 3), (1, 20, 60, 3), (1, 40, 13, 3)], ids=str)
 def test_loss_and_gradient_equal_the_float64_reference(shape):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     target = torch.rand(shape, generator=generator)
     noise = 0.1 * torch.randn(shape, generator=generator)
     noise[:, : shape[1] // 2] = 0  # where both images agree, L1 has a kink: its gradient there is 0
@@ -76,13 +79,13 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
         results.append((loss.detach().double(), psnr.double(), x.grad.double()))
     fast, reference = results
     assert not torch.equal(reference[2], torch.zeros_like(reference[2]))
-    torch.testing.assert_close(fast[0], reference[0], atol=2e-6, rtol=0)
-    torch.testing.assert_close(fast[1], reference[1], atol=1e-5, rtol=0)
-    torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
+    assert_within(fast[0], reference[0], 2e-6)
+    assert_within(fast[1], reference[1], 1e-5)
+    assert_within_peak(fast[2], reference[2], 5e-5)
 
 
 def test_the_loss_does_not_depend_on_how_many_rows_a_program_handles(monkeypatch):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     target = torch.rand((1, 35, 12, 3), generator=generator).to(DEVICE)
     results = []
     for programs in (1, 1000):  # One of 35 rows, and three of at most 16
@@ -92,7 +95,7 @@ def test_the_loss_does_not_depend_on_how_many_rows_a_program_handles(monkeypatch
         loss.backward()
         results.append([loss.detach(), psnr, x.grad])
     for of_one, of_three in zip(*results, strict=True):
-        torch.testing.assert_close(of_one, of_three, atol=1e-6 * float(of_three.abs().max()), rtol=0)
+        assert_within_peak(of_one, of_three, 1e-6)
 
 
 @pytest.mark.parametrize("size", [(1, 11, 33), (4, 532, 2397), (1, 1060, 4800), (2, 3000, 12000)], ids=str)
@@ -106,7 +109,7 @@ def test_programs_of_the_loss_cover_the_images_and_run_at_the_same_time(size):
 
 
 def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     images = torch.randint(0, 256, (2, 21, 47, 3), generator=generator, dtype=torch.uint8).to(DEVICE)
     predicted = torch.rand((2, 21, 47, 3), generator=generator).to(DEVICE)
     results = []
@@ -118,11 +121,11 @@ def test_the_loss_reads_bytes_as_the_floats_that_they_stand_for():
     # On a GPU the product with 1/255 is fused with the sum that follows it, and not rounded in between.
     rounding = 1e-6 if DEVICE.type == "cuda" else 0.0
     for of_bytes, of_floats in zip(*results, strict=True):
-        torch.testing.assert_close(of_bytes, of_floats, atol=rounding * float(of_floats.abs().max()), rtol=0)
+        assert_within_peak(of_bytes, of_floats, rounding)
     with kernels.triton_switched(False):
         slow = losses.photometric_loss(predicted, images, ssim_lambda=0.3, l2_lambda=1.5)
     actual = results[0][:2]
-    torch.testing.assert_close(actual, list(slow), atol=1e-5, rtol=1e-5)
+    assert_close(actual, list(slow), atol=1e-5, rtol=1e-5)
 
 
 def test_flat_images_have_a_finite_gradient():
@@ -136,7 +139,7 @@ def test_flat_images_have_a_finite_gradient():
 
 @pytest.mark.parametrize("function", [fused_photometric_loss, losses.photometric_loss])
 def test_psnr_carries_no_gradient(function):
-    x = torch.rand((1, 12, 12, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE).requires_grad_()
+    x = torch.rand((1, 12, 12, 3), generator=seeded(0)).to(DEVICE).requires_grad_()
     _, psnr = function(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     assert psnr > 0
     assert not psnr.requires_grad
@@ -150,12 +153,12 @@ def test_psnr_of_extreme_errors_is_torchs(value):
         _, actual = fused_photometric_loss(x, torch.zeros_like(x), ssim_lambda=0.2, l2_lambda=2.0)
     with kernels.triton_switched(False):
         _, expected = losses.photometric_loss(x, torch.zeros_like(x))
-    torch.testing.assert_close(actual, expected, rtol=1e-6, atol=0, equal_nan=True)
+    assert_close(actual, expected, rtol=1e-6, atol=0, equal_nan=True)
 
 
 def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
     """Their numbers are no multiple of what is added at once, and several times as many."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     sums = torch.rand((3, 12150), generator=generator)  # SSIM, and absolute and squared differences
     parts = torch.rand(5000, generator=generator) / 5e6
     loss = torch.zeros((), device=DEVICE)
@@ -257,14 +260,14 @@ def test_an_old_triton_is_left_alone_and_named(nothing_tried, monkeypatch):
 @pytest.mark.parametrize("shape", [(2, 3, 21, 34), (1, 1, 1, 40), (1, 2, 5, 3)], ids=str)
 @pytest.mark.parametrize("axis", [2, 3])
 def test_convolution_equals_torchs_in_float64(shape, axis):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     image = torch.randn(shape, generator=generator)
     kernel = torch.randn(9, generator=generator)
     actual = structure.correlate(image.to(DEVICE), kernel.to(DEVICE), axis)
     weight = kernel.double().view((1, 1, -1, 1) if axis == 2 else (1, 1, 1, -1)).expand(shape[1], -1, -1, -1)
     padding = (4, 0) if axis == 2 else (0, 4)
     expected = torch.nn.functional.conv2d(image.double(), weight, padding=padding, groups=shape[1])
-    torch.testing.assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
+    assert_close(actual.cpu().double(), expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +275,7 @@ def test_convolution_equals_torchs_in_float64(shape, axis):
     [(False, 0.0, None), (False, 2.0, 1e-3), (True, 0.0, 1e-3), (True, 2.0, None), ("transposed", 2.0, None)],
 )
 def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, energy_blur, epsilon):
-    images = torch.rand((2, 9, 14, 3), generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    images = torch.rand((2, 9, 14, 3), generator=seeded(0)).to(DEVICE)
     masks = torch.ones((2, 9, 14), dtype=torch.bool, device=DEVICE) if masked else None
     if masks is not None:
         masks[0, 3:6, 5:7] = False
@@ -291,11 +294,11 @@ def test_structure_tensors_are_the_same_with_the_kernels(monkeypatch, masked, en
     actual = multiscale_structure_tensor(images, masks, **options)
     assert set(calls) == {"correlate", "differentiate", "aggregate"}
     atol = 1e-5 * float(expected.nan_to_num().abs().max())
-    torch.testing.assert_close(actual.double(), expected, atol=atol, rtol=1e-4, equal_nan=True)
+    assert_close(actual.double(), expected, atol=atol, rtol=1e-4, equal_nan=True)
 
 
 def test_quantized_tensors_are_the_references_or_their_neighbours(monkeypatch):
-    tensor = torch.rand((3, 100, 3), generator=torch.Generator().manual_seed(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
+    tensor = torch.rand((3, 100, 3), generator=seeded(0)) ** 8 * torch.tensor([16.0, 1.0, 16.0])
     tensor[0, :4] = torch.tensor([[0.0, 0, 0], [64, 0, 1e-12], [0, 0.1, 1], [8, -9, 8]])
     tensor[1, :4] = torch.tensor([[math.nan] * 3, [math.nan, 0, 1], [1, math.nan, 1], [1, 0, math.nan]])  # masked
     with kernels.triton_switched(False):
@@ -312,7 +315,7 @@ def test_quantized_tensors_are_the_references_or_their_neighbours(monkeypatch):
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
 @pytest.mark.parametrize(("degree", "num_others"), [(0, 15), (1, 15), (2, 15), (3, 15), (3, 24)])
 def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degree, num_others, per_axis_radii):
-    generator = torch.Generator().manual_seed(degree)
+    generator = seeded(degree)
     shapes = (40, 3), (40, 3), (40, num_others, 3), (3, 3), (3, 40, 3)
     *values, centres, weights = (torch.randn(shape, generator=generator) for shape in shapes)
     viewmats = small_scenes.cameras_at(centres)
@@ -328,18 +331,18 @@ def test_colours_and_gradients_equal_gsplats_float64_harmonics(monkeypatch, degr
     monkeypatch.setattr(torch, "empty_like", lambda tensor: torch.full_like(tensor, math.nan))
     colors.backward(v_colors)
     positions = small_scenes.centres_of(viewmats)
-    torch.testing.assert_close(positions[:, 0].float(), centres, atol=1e-5, rtol=1e-5)
+    assert_close(positions[:, 0].float(), centres, atol=1e-5, rtol=1e-5)
     slow = means, first, rest = [value.double().requires_grad_() for value in values]
     coefficients = torch.cat([first[:, None], rest], dim=1).expand(3, -1, -1, -1)
     expected = (_spherical_harmonics(degree, means - positions, coefficients) + 0.5).clamp_min(0)
     (expected * weights * drawn[..., None]).sum().backward()
-    torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=2e-6, rtol=2e-6)
+    assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=2e-6, rtol=2e-6)
     assert (expected == 0).any()
     assert (expected > 0).any()
     for actual, reference in zip(fast, slow, strict=True):
         assert actual.grad is not None
         gradient = torch.zeros_like(reference) if reference.grad is None else reference.grad
-        torch.testing.assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
+        assert_close(actual.grad.double().cpu(), gradient, atol=2e-5, rtol=2e-5)
 
 
 @pytest.mark.parametrize("per_axis_radii", [False, True], ids=["gsplat 1.4", "gsplat 1.5"])
@@ -361,7 +364,7 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     )
     radius = info["radii"] if info["radii"].dim() == 2 else info["radii"].amin(dim=-1)
     info["radii"] = torch.stack([radius, 2 * radius], dim=-1) if per_axis_radii else radius
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     factors = torch.randn((2, height, width, 2, 2), generator=generator)
     tensors = factors @ factors.mT
     info |= {"viewmats": viewmats, "Ks": Ks}
@@ -383,7 +386,7 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
             results.append((observed_eta(on_device, info, jitters[0]), statistics))
         assert len(calls) == 3 * fused
     (expected, reference), (eta, fast) = results
-    torch.testing.assert_close(eta, expected, atol=1e-6, rtol=2e-5, equal_nan=True)
+    assert_close(eta, expected, atol=1e-6, rtol=2e-5, equal_nan=True)
     assert torch.equal(eta.isnan().any(dim=2), eta.isnan().all(dim=2))
     assert 0 < eta.isnan().sum() < eta.numel()
     assert reference["n_total"].sum() > n / 2
@@ -395,7 +398,7 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
     for name in STATISTICS:
         if name.startswith("n_"):
             assert torch.equal(fast[name], reference[name]), name
-        torch.testing.assert_close(fast[name], reference[name], atol=1e-6, rtol=2e-5)
+        assert_close(fast[name], reference[name], atol=1e-6, rtol=2e-5)
 
 
 @pytest.mark.parametrize("layout", ["parts of rows", "apart", "transposed"])
@@ -403,7 +406,7 @@ def test_observation_equals_the_reference(monkeypatch, kept, per_axis_radii):
 def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii, layout):
     views = 3
     n = 300
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     rows = torch.randn((views, n, 12), generator=generator)
     rows[0, 1, :2] = math.nan
     rows[1, 2, 10] = math.nan
@@ -438,13 +441,13 @@ def test_screen_gradients_add_up_as_in_the_reference(monkeypatch, per_axis_radii
     assert not reference["grad2d"].isnan().any()
     assert torch.equal(fast.pop("grad_count"), reference["grad_count"])
     for name, value in fast.items():
-        torch.testing.assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
+        assert_close(value, reference[name], atol=1e-5, rtol=1e-6)
 
 
 @pytest.mark.parametrize("used", ["scales", "opacities", "penalty", "scales opacities penalty"])
 @pytest.mark.parametrize("n", [1, 37, 1024, 2050])
 def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n, used):
-    generator = torch.Generator().manual_seed(n)
+    generator = seeded(n)
     log_scales = torch.randn((n, 3), generator=generator)
     logits = torch.randn((n, 1), generator=generator)
     weights = torch.randn((n, 12), generator=generator)
@@ -472,7 +475,7 @@ def test_activations_and_their_gradients_equal_torchs_in_float64(monkeypatch, n,
             torch.zeros_like(value).double() if value.grad is None else value.grad.double() for value in inputs
         ]
     assert len(calls) == 1
-    torch.testing.assert_close(*results, atol=1e-9, rtol=3e-6)
+    assert_close(*results, atol=1e-9, rtol=3e-6)
 
 
 ADAM = {"betas": (0.9, 0.999), "eps": 1e-15}
@@ -496,7 +499,7 @@ def factors(steps: Sequence[int], lrs: Sequence[float]) -> Tensor:
 @pytest.mark.parametrize("rows", [0, 1, 37, 1024], ids="{} Gaussians".format)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-5), (torch.float32, 2e-5)], ids=str)
 def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows, dtype, tolerance):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     start = [torch.randn((rows, *width), generator=generator) for width in WIDTHS]
     expected = [torch.nn.Parameter(p.to(dtype, copy=True)) for p in start]
     groups = [{"params": [p], "lr": lr} for p, lr in zip(expected, LRS, strict=True)]
@@ -518,9 +521,9 @@ def test_adam_in_one_launch_equals_torchs_and_one_launch_for_each_parameter(rows
         if torch.device("cpu") == DEVICE:
             assert all(map(torch.equal, one, other))
         else:  # compiled, a product and a sum may round once in one kernel and twice in another
-            torch.testing.assert_close(one, other, atol=1e-7, rtol=2e-6)
+            assert_close(one, other, atol=1e-7, rtol=2e-6)
     for actual, parameter in zip(together[0], expected, strict=True):
-        torch.testing.assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
+        assert_close(actual.to("cpu", dtype), parameter.detach(), atol=tolerance, rtol=tolerance)
 
 
 @pytest.mark.parametrize("flags", [[], [0], [1], [0, 1], [1, 1]])
@@ -557,7 +560,7 @@ def test_adam_counts_each_parameters_own_updates():
             first = [values[:1] for values in (actual[0], gradients, *actual[1:])]
             adam.adam_step(*first, factors([step], [0.1]), noted, **OURS)
     for p, q in zip(actual[0], expected, strict=True):
-        torch.testing.assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
+        assert_close(p.double().cpu(), q.detach(), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -1e30])
@@ -592,14 +595,14 @@ def test_an_update_keeps_torchs_state_while_it_runs_the_kernel(monkeypatch):
         again.launch({"a": torch.ones(50, device=DEVICE)}, again.factors().to(DEVICE), noted)
         states.append((update.parameters["a"], again.parameters["a"], adam_of["a"].state_dict()["state"]))
     (*slow, slow_state), (*fast, fast_state) = states
-    torch.testing.assert_close(fast, slow, atol=1e-6, rtol=1e-6)
+    assert_close(fast, slow, atol=1e-6, rtol=1e-6)
     assert slow_state.keys() == fast_state.keys() == {0}
     assert slow_state[0].keys() == fast_state[0].keys()
 
 
 def projected_gaussians(num_views: int, n: int, width: int, height: int) -> dict[str, Tensor]:
     """Projected Gaussians of all sizes, of which some are long and thin, faint, culled or off the image."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def random(*shape: int) -> Tensor:
         return torch.rand((num_views, n, *shape), generator=generator)
@@ -811,7 +814,7 @@ def test_far_off_the_axis_radii_are_zero_as_torch_makes_them(few_programs, per_a
 @pytest.mark.parametrize(("num_pairs", "num_tiles"), [(0, 5), (1, 1), (700, 40), (1000, 1500), (513, 512)])
 def test_the_lists_order_and_starts_are_torchs(dtype, num_pairs, num_tiles):
     """Most tiles have no pair in the longest case, and neither number is a multiple of what a program handles."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     numbers = torch.randint(0, num_tiles, (num_pairs,), generator=generator) - 2**15
     sorted_tiles, by_tile = numbers.to(dtype).to(DEVICE).sort(stable=True)
     ids = torch.randperm(num_pairs, generator=generator).int().to(DEVICE)

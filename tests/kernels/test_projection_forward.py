@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from helpers import gsplat_stub
+from helpers.closeness import assert_within_share
+from helpers.generators import seeded
 from helpers.random_gaussians import nearly_aligned_viewmats
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import backend_torch
@@ -28,7 +30,7 @@ Scene = dict[str, Tensor]
 
 def random_scene(num_views: int) -> Scene:
     """N Gaussians of all forms; some are faint, beside, behind or too near to the cameras. In float64."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -234,7 +236,7 @@ def test_what_has_no_finite_projection_is_not_drawn(value: str, per_axis_radii: 
 )
 def test_what_is_drawn_is_finite(per_axis_radii: bool, monkeypatch: Any):
     use_layout(monkeypatch, per_axis_radii)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def numbers(*shape: int) -> Tensor:
         exponents = 38 * (2 * torch.rand(shape, generator=generator) - 1)
@@ -261,7 +263,7 @@ def test_scales_of_zero_leave_the_blur():
     assert (radii > 0).all()
     blur = 1 / gsplat_compat.SCREEN_BLUR
     expected = torch.tensor([blur, 0.0, blur]).expand(1, 2, 3)
-    torch.testing.assert_close(conics, expected, rtol=1e-6, atol=0)
+    assert_within_share(conics, expected, 1e-6)
 
 
 @pytest.mark.hard_case("a Gaussian behind, at and before the near plane", "it is drawn from the near plane on")

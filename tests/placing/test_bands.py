@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from helpers.drawn_photos import draw_photos
+from helpers.json_files import write_json
 from sadgs_ns.placing.folder import look_into
 
 INFRARED = b'<rdf:Description drone-dji:ImageSource="InfraredCamera"/>'
@@ -209,7 +209,7 @@ def test_photos_that_a_scene_has_stay(tmp_path: Path):
     known = [name for name in names if "_T." in name][:2]
     settings = tmp_path / "out" / "work" / "settings.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"photos": known}))
+    write_json(settings, {"photos": known})
     found, _, told = look_into(tmp_path, tmp_path / "out")
     assert [name for name in found if "_T." in name] == known
     assert told == [THERMAL.format(2, "DJI_20260501100003_0002_T.JPG")]
@@ -219,7 +219,7 @@ def test_thermal_images_that_are_added_to_thermal_ones_stay(tmp_path: Path):
     names = draw(tmp_path, all_thermal)
     settings = tmp_path / "out" / "work" / "settings.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"photos": names[:3]}))
+    write_json(settings, {"photos": names[:3]})
     assert look_into(tmp_path, tmp_path / "out") == (names, {}, [])
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 from PIL import Image
 
 from helpers.drawn_photos import color_profile
+from helpers.json_files import read_json, write_json
 from sadgs_ns.cli.process import main
 from sadgs_ns.placing import place
 from sadgs_ns.placing.bit_depth import depth_of, read_scaled
@@ -97,7 +97,8 @@ def test_values_of_few_bits_are_scaled_by_the_largest_of_all_photos(
         assert image.dtype == np.uint8
         assert image[:, 8:].max() <= 3
     told = f"4 photos of 16 bits use {depth} of them (largest value {largest:,}): {white:,} becomes white.\n"
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
 
 
 @pytest.mark.hard_case("photos whose values use all of 16 bits", "are read as they are, without a line")
@@ -105,7 +106,8 @@ def test_photos_of_16_bits_are_taken_as_they_are(tmp_path: Path, taken: list[Tak
     photos = write(tmp_path / "photos", a=stored(0, 99, 150), b=stored(16384), c=stored(1))
     assert main([str(photos), str(tmp_path / "out")]) == 0
     assert taken[0].unchanged == {"a.png", "b.png", "c.png"}
-    assert "photos of 16 bits" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "photos of 16 bits" not in printed
 
 
 @pytest.mark.hard_case(
@@ -129,7 +131,8 @@ def test_the_bits_that_were_chosen_first_stay(tmp_path: Path, taken: list[Taken]
     told = (
         "use 12 of them (largest value 60,000): 4,095 becomes white. The first photos of the scene decided this; 1 of"
     )
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
     write(photos, f=stored(819, 0, 0))
     assert main(command) == 0
     assert left(taken[2].pixels["f.png"]) == [0, 0, 51]
@@ -147,9 +150,9 @@ def test_a_scene_of_an_earlier_version_is_as_dark_as_before(tmp_path: Path, take
     command = [str(photos), str(tmp_path / "out")]
     assert main(command) == 0
     settings = tmp_path / "out" / "work" / "settings.json"
-    described = json.loads(settings.read_text())
+    described = read_json(settings)
     assert described.pop("bit_depth") == 12
-    settings.write_text(json.dumps(described))
+    write_json(settings, described)
     write(photos, d=stored(0, 0, 819))
     assert main(command) == 0
     assert taken[1].unchanged == {"a.png", "b.png", "c.png", "d.png"}

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from helpers.colmap_database import rows_of
 from helpers.drawn_photos import draw_photos
@@ -71,7 +72,7 @@ def test_each_pair_of_a_plan_is_matched_in_its_order(ahead: ModuleType):
     for one, other in pairs[:3]:
         expected = match_descriptors(*(torch.from_numpy(by_name[name].descriptors) for name in (one, other)))
         found = matches[by_name[one].image_id, by_name[other].image_id]
-        np.testing.assert_array_equal(found, expected.numpy())
+        assert_array_equal(found, expected.numpy())
     assert len(matches[1, 2]) >= 15
 
 

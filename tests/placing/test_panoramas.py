@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
 from collections import defaultdict
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 from PIL import Image
 
 from helpers.drawn_photos import draw_panorama, draw_photo, draw_photos, panorama_centres
+from helpers.json_files import read_json
 from sadgs_ns.cli.process import Process, main, process
 from sadgs_ns.placing.panoramas import VIEWS, cut, is_fisheye_pair, is_panorama, rotations
 from sadgs_ns.placing.photos import read_photos
@@ -76,7 +76,7 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
     assert summary.registered == 11 * VIEWS
     printed = capsys.readouterr().out
     assert "11 of the 11 photos are panoramas: each is cut into 8 views of 90°" in printed
-    described = json.loads((out / "transforms.json").read_text())
+    described = read_json(out / "transforms.json")
     assert described["val_filenames"] == described["test_filenames"] == [f"images/04.jpg/{i}.jpg" for i in range(VIEWS)]
     assert len(described["train_filenames"]) == 10 * VIEWS
     assert len(described["frames"]) == 11 * VIEWS
@@ -92,8 +92,9 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
     summary = process(Process(source, out, matching="exhaustive"))
     assert summary.photos == COUNT * VIEWS + 2
     assert summary.registered == COUNT * VIEWS + 2
-    assert "12 of the 14 photos are panoramas" in capsys.readouterr().out
-    grown = json.loads((out / "transforms.json").read_text())
+    printed = capsys.readouterr().out
+    assert "12 of the 14 photos are panoramas" in printed
+    grown = read_json(out / "transforms.json")
     frames = {frame["file_path"]: frame for frame in grown["frames"]}
     assert all(frames[frame["file_path"]] == frame for frame in described["frames"])
     assert grown["test_filenames"] == described["test_filenames"]

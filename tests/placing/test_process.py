@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import errno
 import itertools
-import json
 import os
 import resource
 import shutil
@@ -39,11 +38,13 @@ from PIL.TiffImagePlugin import IFDRational
 from rich.progress import Progress
 
 from helpers.drawn_photos import HEIGHT, VIEWS, WIDTH, camera_centres, color_profile, draw_photos, walk_centres
+from helpers.json_files import read_json, write_json
+from helpers.refusals import refusal
 from sadgs_ns.cli import process as program
 from sadgs_ns.cli.process import Process, main, process
 from sadgs_ns.data.checks.transforms import check_nerfstudio
 from sadgs_ns.data.layouts import ParserOptions
-from sadgs_ns.errors import InputError, RunError
+from sadgs_ns.errors import RunError
 from sadgs_ns.placing import features, place, reconstruct
 from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
@@ -211,7 +212,8 @@ def test_photos_of_a_walk_straight_ahead_register(tmp_path: Path, capsys):
     for i, photo in enumerate(draw_photos(walk_centres())):
         photo.save(tmp_path / "photos" / f"{i:02d}.png")
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 0
-    assert "10 of 10 photos registered" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "10 of 10 photos registered" in printed
     assert errors_of_centres(tmp_path / "out", walk_centres()).max() < 0.02
 
 
@@ -287,7 +289,7 @@ def test_photos_that_are_added_are_tried_again_however_many_there_are(
     assert told == f"A first attempt registered {VIEWS - 1}, one with relaxed limits {VIEWS}."
 
     failing = 4
-    with pytest.raises(InputError, match="related to the others: give another output folder, for which all photos"):
+    with refusal("related to the others: give another output folder, for which all photos"):
         reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "other", base)
     assert angles == [8, 4, 8, 4]
     assert not (tmp_path / "other").exists()
@@ -331,9 +333,7 @@ def test_cameras_without_points_are_none(run: Run, photos: Path, tmp_path: Path,
         model.delete_point3D(point)
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *others, **callbacks: {0: model})
     names = sorted(photo.name for photo in photos.iterdir())
-    with pytest.raises(
-        InputError, match=r"could be related to each other .*; take more of them, from different places"
-    ):
+    with refusal(r"could be related to each other .*; take more of them, from different places"):
         reconstruct.place_cameras(photos, names, tmp_path / "database.db", tmp_path / "model", None)
     assert not (tmp_path / "model").exists()
 
@@ -421,7 +421,8 @@ def test_a_finished_scene_keeps_what_photos_are_added_to_and_is_known_again(run:
     expected = {path: path.stat().st_mtime_ns for path in run.out.rglob("*")}
     assert before == expected
     assert main([str(photos), str(run.out), "--max-size", "80"]) == 2
-    assert "(--max-size was 1600, is 80); give another folder" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "(--max-size was 1600, is 80); give another folder" in errors
 
 
 def test_a_film_gives_its_sharpest_frames(scene: Path, tmp_path: Path):
@@ -493,9 +494,11 @@ def test_an_archive_of_photos_is_no_video(kind: str, tmp_path: Path, capsys):
     archive = Path(shutil.make_archive(str(tmp_path / "archives" / "photos"), kind, tmp_path / "photos"))
     assert main([str(archive), str(tmp_path / "out")]) == 2
     sentence = f"{archive} is an archive: unpack it, and give the folder of its photos or videos."
-    assert capsys.readouterr().err == f"sadgs-process: {sentence}\n"
+    errors = capsys.readouterr().err
+    assert errors == f"sadgs-process: {sentence}\n"
     assert main([str(archive.parent), str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
+    errors = capsys.readouterr().err
+    assert errors.endswith(f"It holds archives (1, such as {archive.name}): unpack them.\n")
     assert not (tmp_path / "out").exists()
 
 
@@ -511,9 +514,11 @@ def test_files_of_360_degree_cameras_must_be_stitched(suffix: str, tmp_path: Pat
     assert main([str(folder), str(tmp_path / "out")]) == 2
     stitch = "(stitch them to panoramas or films of 2:1 with the camera's program): 3, such as 0"
     sentence = f"better 30 or more. Left out as files of 360° cameras {stitch}{suffix}.\n"
-    assert sentence in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert sentence in errors
     assert main([str(folder / f"0{suffix}"), str(tmp_path / "out")]) == 2
-    assert "stitch it to a panorama or film of 2:1 with the camera's program." in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "stitch it to a panorama or film of 2:1 with the camera's program." in errors
 
 
 @pytest.mark.hard_case("videos of camcorders (`.mts`, `.mxf`, `.mpeg`) in a folder", "read as others")
@@ -531,7 +536,7 @@ def test_what_ffmpeg_alone_takes_for_a_video_is_none(tmp_path: Path):
     for name, problem in (("a.jpg", "is a single image"), ("a.png", "is a single image"), ("a.txt", "it is a text")):
         if not (tmp_path / name).exists():
             photo.save(tmp_path / name)
-        with pytest.raises(InputError, match=problem):
+        with refusal(problem):
             count_frames(tmp_path / name)
 
 
@@ -596,7 +601,7 @@ def test_all_photos_that_are_not_whole_are_named(tmp_path: Path, capsys):
     assert all(f"{name} (" in printed for name in ("b.jpg", "c.png", "d.webp", "e.tif", "i.png"))
     assert "g.jpg (0 bytes), h.jpg (0 bytes)" in printed
     assert "copy them again or remove them" in printed
-    with pytest.raises(InputError, match=r"0\.jpg \(.*, 19\.jpg \(.*\), 5 more; copy"):
+    with refusal(r"0\.jpg \(.*, 19\.jpg \(.*\), 5 more; copy"):
         read_photos(tmp_path, [f"{i}.jpg" for i in range(25)], lambda *step: None)
 
 
@@ -614,7 +619,7 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, names[-1])
     assert find_source(tmp_path, tmp_path / "out")[0] == names
     black(tmp_path, "line\nbreak.png")
-    with pytest.raises(InputError, match=r"unprintable characters in its name, 'line.nbreak.png': rename it"):
+    with refusal(r"unprintable characters in its name, 'line.nbreak.png': rename it"):
         find_source(tmp_path, tmp_path / "out")
 
 
@@ -663,7 +668,8 @@ def test_an_output_folder_that_is_a_loop_of_links_is_named(photos: Path, tmp_pat
 @pytest.mark.parametrize("size", ["-5", "5", "63"])
 def test_a_size_without_structure_is_refused(tmp_path: Path, size: str, capsys):
     assert main([str(tmp_path), str(tmp_path / "out"), "--max-size", size]) == 2
-    assert "--max-size must be at least 64 px, or 0 to keep the photos' size" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "--max-size must be at least 64 px, or 0 to keep the photos' size" in errors
 
 
 @pytest.mark.hard_case(
@@ -674,7 +680,8 @@ def test_a_converted_photo_never_replaces_another_one(tmp_path: Path, capsys):
         Image.new("RGB", (320, 240), (grey,) * 3).save(tmp_path / name)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     assert main([str(tmp_path), str(tmp_path / "scene")]) == 2
-    assert "converted, two photos would be called a.webp.jpg; rename one" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "converted, two photos would be called a.webp.jpg; rename one" in errors
     actual = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
     assert actual == before
 
@@ -700,10 +707,11 @@ def test_names_with_spaces_and_webp_and_transparent_photos(tmp_path: Path, capsy
         suffix, kind = kinds[i]
         photo.save(tmp_path / "photos" / f"my photo {i}.{suffix}", kind, lossless=kind == "WEBP", quality=98)
     summary = process(Process(tmp_path / "photos", tmp_path / "out", max_size=80))
-    assert "2 photos are partly transparent" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "2 photos are partly transparent" in printed
     assert summary.registered == 6
     assert not summary.left_out
-    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    frames = read_json(tmp_path / "out" / "transforms.json")["frames"]
     assert len(frames) == 6
     transparent = []
     for frame in frames:
@@ -754,7 +762,7 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
     summary = process(Process(tmp_path / "photos", tmp_path / "out"))
     assert summary.registered == VIEWS
     assert errors_of_centres(tmp_path / "out", camera_centres()).max() < 0.05
-    described = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    described = read_json(tmp_path / "out" / "transforms.json")
     assert described["w"] > described["h"]
     for name in (frame["file_path"] for frame in described["frames"]):
         with Image.open(tmp_path / "out" / name) as image:
@@ -814,7 +822,8 @@ def test_photos_that_are_added_are_turned_and_get_masks_if_the_scene_has_some(
     assert made == dict.fromkeys(("a.jpg", "b.jpg", "c.jpg", "d.jpg"), photo.size)
     white = dict.fromkeys(("a.jpg.png", "b.jpg.png", "c.jpg.png"), (255, 255))
     assert masks == (white | {"d.jpg.png": (0, 0)} if has_masks else {})
-    assert f"Masks of 1 photos are {'used' if has_masks else 'not used'}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"Masks of 1 photos are {'used' if has_masks else 'not used'}" in printed
 
 
 @pytest.mark.hard_case(
@@ -855,7 +864,7 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
         "Left out as masks of no photo: 1, such as masks/none.png.",
     ]
     (tmp_path / "out" / "work").mkdir(parents=True)
-    (tmp_path / "out" / "work" / "settings.json").write_text(json.dumps({"photos": [*left, "images/b.jpg"]}))
+    write_json(tmp_path / "out" / "work" / "settings.json", {"photos": [*left, "images/b.jpg"]})
     actual = look_into(tmp_path, tmp_path / "out")[0]
     expected = sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
     assert actual == expected
@@ -982,7 +991,8 @@ def test_a_name_that_leaves_no_room_for_a_suffix_is_refused(tmp_path: Path, caps
         else:
             assert main([str(photos), str(tmp_path / "out")]) == 2
             sentence = f"{photos} holds a photo with a name of more than 247 bytes, {name}: rename it, since its mask"
-            assert f"sadgs-process: {sentence} and its copies have longer names.\n" == capsys.readouterr().err
+            errors = capsys.readouterr().err
+            assert f"sadgs-process: {sentence} and its copies have longer names.\n" == errors
     assert not (tmp_path / "out").exists()
 
 
@@ -1007,7 +1017,8 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str
         mask.resize((8, 6)).save(photos / "masks" / "b.png")
     assert main([str(photos), str(tmp_path / "out")]) == 2
     told = "masks/b.png has another shape than b.png, whose mask it is by its name: make it of the whole photo, or take"
-    assert told in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert told in errors
     (photos / "masks" / "b.png").unlink()
     assert main([str(photos), str(tmp_path / "out")]) == 130
     assert taken == [["a.png", "b.png", "c.png"]]
@@ -1266,13 +1277,16 @@ def test_a_scene_of_few_of_the_photos_is_warned_of(
     assert actual == {"settings.json", "database.db", "alpha"}
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
     remedy = "photos saw. Try another folder with the photos in their original size, since these are "
-    assert remedy in capsys.readouterr().err, "photos of a few px"
+    errors = capsys.readouterr().err
+    assert remedy in errors, "photos of a few px"
     monkeypatch.setattr("sadgs_ns.placing.plan.SMALL_PHOTO", 8)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 1
-    assert "photos saw. Try another folder with more photos between" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "photos saw. Try another folder with more photos between" in errors
     registered(6)
     assert main([str(photos), str(tmp_path / "out"), "--matching", "exhaustive"]) == 0
-    assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"Train:  ns-train sadgs --data {tmp_path / 'out'}\n" in printed
 
 
 def test_wrong_cameras_are_warned_of_and_their_scene_is_not_finished(
@@ -1322,9 +1336,10 @@ def test_the_library_tells_its_caller_and_prints_nothing(
     assert events == ["unchanged"]
     assert len(steps) == 3
     for wrong, told in (({"frames": 2}, "--frames must be at least 3"), ({"max_size": 63}, "--max-size must be at l")):
-        with pytest.raises(InputError, match=told):
+        with refusal(told):
             place_photos(dataclasses.replace(options, **wrong), print, print)
-    assert capsys.readouterr().out == ""
+    printed = capsys.readouterr().out
+    assert printed == ""
 
 
 @pytest.mark.hard_case(
@@ -1333,7 +1348,7 @@ def test_the_library_tells_its_caller_and_prints_nothing(
 def test_photos_that_colmap_could_not_write_are_told(tmp_path: Path):
     """COLMAP says nothing where the disk is full."""
     folder = black(tmp_path / "undistorted", "images/a.png", "images/b.png")
-    (folder / "transforms.json").write_text(json.dumps({"frames": [{"file_path": f"images/{n}.png"} for n in "ab"]}))
+    write_json(folder / "transforms.json", {"frames": [{"file_path": f"images/{n}.png"} for n in "ab"]})
     (folder / "images" / "b.png").write_bytes((folder / "images" / "b.png").read_bytes()[:30])
     with pytest.raises(OSError, match=r"images could not be written \(the disk is full; .* free there"):
         publish(folder, tmp_path, grown=False)
@@ -1352,7 +1367,8 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("sadgs_ns.placing.place.make_model", run_another)
     assert main(command) == 130
     assert not (tmp_path / "out" / "work" / "models").exists()
-    assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in errors
 
 
 @pytest.mark.hard_case(
@@ -1442,7 +1458,8 @@ def test_photos_without_texture_are_told_in_a_sentence(tmp_path: Path, capsys):
     for i in range(3):
         Image.new("RGB", (64, 64), (i, i, i)).save(tmp_path / "photos" / f"{i}.png")
     assert main([str(tmp_path / "photos"), str(tmp_path / "out")]) == 2
-    assert "no two photos could be related to each other (3 of 3 have fewer than 500" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "no two photos could be related to each other (3 of 3 have fewer than 500" in errors
     assert not (tmp_path / "out" / "transforms.json").exists()
 
 
@@ -1451,9 +1468,11 @@ def test_other_folders_and_settings_are_left_alone(run: Run, photos: Path, tmp_p
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "file").write_text("x")
     assert main([str(photos), str(tmp_path / "mine")]) == 2
-    assert "is not a scene that sadgs-process began" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "is not a scene that sadgs-process began" in errors
     assert main([str(photos), str(run.out), "--camera-per-photo"]) == 2
-    assert "was begun with other photos or settings" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "was begun with other photos or settings" in errors
 
 
 class Pipe:
@@ -1589,10 +1608,12 @@ def test_a_folder_of_films_gives_frames_of_each(tmp_path: Path, taken: list[list
     assert taken[0] == expected
     told = ["Its photos (1, such as still.png) are not used: fewer than 3."]
     assert find_source(folder, tmp_path / "out")[3] == told
-    assert "Frames of 3 videos are taken, each with a camera of its own" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Frames of 3 videos are taken, each with a camera of its own" in printed
     record(folder / "c.webm", "libvpx", "webm", [0])
     assert main(command) == 2
-    assert "settings (videos added: 1, such as c.webm); give another folder or delete" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "settings (videos added: 1, such as c.webm); give another folder or delete" in errors
 
 
 @pytest.mark.hard_case("videos beside the photos of a folder, as iPhones keep them", "left out, and told of")
@@ -1601,7 +1622,8 @@ def test_films_beside_photos_are_told_of(tmp_path: Path, registered: Callable[[i
     (photos / "a.MOV").write_bytes(b"a film")
     registered(9)
     assert main([str(photos), str(tmp_path / "out")]) == 0
-    assert "Its videos (1, such as a.MOV) are not used: give them in a folder of" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Its videos (1, such as a.MOV) are not used: give them in a folder of" in printed
 
 
 @pytest.mark.hard_case(
@@ -1613,17 +1635,20 @@ def test_poses_of_other_programs_are_told_of(tmp_path: Path, registered: Callabl
     (photos / "others.csv").mkdir()
     registered(9)
     assert main([str(photos), str(tmp_path / "out")]) == 0
-    assert capsys.readouterr().out.startswith(f"Poses are computed anew. {photos}/poses.csv has poses: `ns-")
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"Poses are computed anew. {photos}/poses.csv has poses: `ns-")
 
 
 @pytest.mark.hard_case("a cut video, one of two frames, a photo as the video", "refused in a sentence")
 def test_a_film_that_is_none_is_told_in_a_sentence(tmp_path: Path, capsys):
     (tmp_path / "film.mp4").write_bytes(b"no film")
     assert main([str(tmp_path / "film.mp4"), str(tmp_path / "out")]) == 2
-    assert "film.mp4 cannot be read as a video (Invalid data found" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "film.mp4 cannot be read as a video (Invalid data found" in errors
     film(tmp_path / "short.avi", 2)
     assert main([str(tmp_path / "short.avi"), str(tmp_path / "out")]) == 2
-    assert "short.avi gives 2 frames; a reconstruction needs at least 3" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "short.avi gives 2 frames; a reconstruction needs at least 3" in errors
     assert not (tmp_path / "out").exists()
 
 
@@ -1709,7 +1734,8 @@ def test_another_number_of_frames_or_another_film_is_another_scene(tmp_path: Pat
     film(tmp_path / "film.avi", 9)
     assert main([*command, "4"]) == 2
     assert len(taken) == 2
-    assert "settings (videos changed: 1, such as film.avi); put these videos back, give" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "settings (videos changed: 1, such as film.avi); put these videos back, give" in errors
 
 
 def test_photos_added_or_removed_while_it_is_not_finished_make_another_scene(
@@ -1725,10 +1751,12 @@ def test_photos_added_or_removed_while_it_is_not_finished_make_another_scene(
     assert main(command) == 2
     assert len(taken) == 2
     changes = "photos added: 2, such as day/b.png; photos removed: 1, such as b.png"
-    assert f"settings ({changes}); put these photos back, give another folder or delete it." in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"settings ({changes}); put these photos back, give another folder or delete it." in errors
     other = black(tmp_path / "other", "a.png", "b.png", "c.png")
     assert main([str(other), str(tmp_path / "out")]) == 2
-    assert f"(source was {photos.resolve()}, is {other.resolve()})" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"(source was {photos.resolve()}, is {other.resolve()})" in errors
 
 
 LATER = [f"{i:02d}.png" for i in (0, 4, 9)]
@@ -1756,7 +1784,7 @@ def grown(photos: Path, seven: Path) -> Iterator[tuple[Path, Path, dict[str, Any
     shutil.copytree(seven / "before", now, symlinks=True)
     for name in LATER:
         shutil.copy2(photos / name, now / "photos")
-    yield now / "photos", now / "out", json.loads((now / "out" / "transforms.json").read_text())
+    yield now / "photos", now / "out", read_json(now / "out" / "transforms.json")
     shutil.rmtree(now)
 
 
@@ -1768,7 +1796,7 @@ def grown(photos: Path, seven: Path) -> Iterator[tuple[Path, Path, dict[str, Any
 def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, dict[str, Any]], capsys):
     source, out, before = grown
     before |= {"dataparser_scale": 2.0, "test_filenames": ["images/01.png"]}  # A run may have noted these.
-    (out / "transforms.json").write_text(json.dumps(before))
+    write_json(out / "transforms.json", before)
     model = out / "work" / "model"
     images = {path.name: path.stat() for path in (out / "images").iterdir()}
     old = pycolmap.Reconstruction(model)
@@ -1782,13 +1810,13 @@ def test_added_photos_leave_the_cameras_that_are_there(grown: tuple[Path, Path, 
     with pytest.MonkeyPatch.context() as patched:
         spy_on_stages(patched, stop)
         assert main([str(source), str(out), "--max-size", "120"]) == 143
-        assert json.loads((out / "transforms.json").read_text()) == before
+        assert read_json(out / "transforms.json") == before
         assert model.is_dir()
         assert main([str(source), str(out), "--max-size", "120"]) == 0
     printed = capsys.readouterr().out
     assert "3 photos added to 7.\n" in printed
     assert f"{VIEWS} of {VIEWS} photos registered" in printed
-    described = json.loads((out / "transforms.json").read_text())
+    described = read_json(out / "transforms.json")
     frames = {frame["file_path"]: frame for frame in described["frames"]}
     assert len(frames) == VIEWS
     for frame in before["frames"]:
@@ -1817,7 +1845,7 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     with Image.open(source / "09.png") as photo:
         photo.resize((120, 90)).save(source / "09.png")
     assert process(Process(source, out, max_size=120)).registered == 8
-    described = json.loads((out / "transforms.json").read_text())
+    described = read_json(out / "transforms.json")
     widths = {frame["file_path"]: frame["w"] for frame in described["frames"]}
     # Without distortion, an image can be a column narrower than its photo.
     assert "w" not in described
@@ -1837,11 +1865,13 @@ def test_added_photos_that_match_none_are_told_of_and_may_be_taken_out_again(
         (source / name).unlink()
     shutil.copy2(photos / "fog.png", source)
     assert main([str(source), str(out), "--max-size", "120"]) == 2
-    assert "sadgs-process: none of the photos that were added could be related to the" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "sadgs-process: none of the photos that were added could be related to the" in errors
     (source / "fog.png").unlink()
     assert main([str(source), str(out), "--max-size", "120"]) == 0
-    assert "7 of 7 photos registered" in capsys.readouterr().out
-    assert json.loads((out / "transforms.json").read_text()) == before
+    printed = capsys.readouterr().out
+    assert "7 of 7 photos registered" in printed
+    assert read_json(out / "transforms.json") == before
 
 
 @pytest.mark.hard_case(
@@ -1856,8 +1886,9 @@ def test_photos_are_added_only_where_the_others_are_as_they_were(grown: tuple[Pa
     command = [str(source), str(out), "--max-size", "120"]
     assert main(command) == 2
     told = "(photos changed: 1, such as 01.png; photos removed: 1, such as 06.png); put these photos back, give another"
-    assert told in capsys.readouterr().err
-    assert json.loads((out / "transforms.json").read_text()) == before
+    errors = capsys.readouterr().err
+    assert told in errors
+    assert read_json(out / "transforms.json") == before
 
 
 @pytest.mark.hard_case(
@@ -1877,11 +1908,13 @@ def test_other_masks_make_another_scene(tmp_path: Path, registered: Callable[[in
     mask.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     capsys.readouterr()
     assert main(command) == 2
-    assert "(photos changed: 1, such as masks/a.png); put these photos back, give another" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "(photos changed: 1, such as masks/a.png); put these photos back, give another" in errors
     mask.rename(mask.with_name("b.png"))
     assert main(command) == 2
     changes = "photos added: 1, such as masks/b.png; photos removed: 1, such as masks/a.png"
-    assert f"({changes}); put these photos back, give another" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"({changes}); put these photos back, give another" in errors
     mask.with_name("b.png").unlink()
     mask.write_bytes(content)
     black(photos, "d.png", "masks/d.png")
@@ -1899,7 +1932,8 @@ def test_photos_cannot_be_added_to_a_scene_whose_features_are_not_there(
     source, out, _ = grown
     (out / "work" / "database.db").unlink()
     assert main([str(source), str(out), "--max-size", "120"]) == 2
-    assert "no longer holds the features and the model that photos could be added to" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "no longer holds the features and the model that photos could be added to" in errors
 
 
 def test_an_unreadable_photo_can_be_removed(tmp_path: Path, taken: list[list[str]]):

@@ -49,4 +49,5 @@ def test_the_files_are_those_of_nerfstudio(tmp_path: Path, monkeypatch: pytest.M
     for name in ("sparse_pc.ply", "transforms.json"):
         assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes()
     assert model.num_points3D() == 99, "the model stays as it is"
-    assert capsys.readouterr().out == ""
+    printed = capsys.readouterr().out
+    assert printed == ""

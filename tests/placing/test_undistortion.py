@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from helpers.drawn_textures import energy, photograph, psnr
@@ -68,7 +69,7 @@ def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
     at_y, at_x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     found = np.array([(at_x * image).sum(), (at_y * image).sum()]) / image.sum()
     expected = np.asarray(undistorted.img_from_cam(ray))[0]
-    np.testing.assert_allclose(found, expected, atol=0.05)
+    assert_allclose(found, expected, atol=0.05)
 
 
 def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -108,7 +109,7 @@ def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Pa
         camera = cameras[made.images[int(file.stem)].camera_id]
         warp = warp_of(camera, options)
         assert warp is not None
-        np.testing.assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
+        assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
 
 
 def model_of_photos(folder: Path, number: int) -> pycolmap.Reconstruction:
@@ -168,9 +169,9 @@ def test_keypoints_of_the_model_move_with_the_images():
     rays = np.c_[np.asarray(camera.cam_from_img(points))[:, :2], np.ones(2)]
     expected = np.asarray(new.img_from_cam(rays))
     actual = [point.xy for point in model.images[1].points2D]
-    np.testing.assert_allclose(actual, expected, atol=1e-9)
+    assert_allclose(actual, expected, atol=1e-9)
     actual = [point.xy for point in made.images[1].points2D]
-    np.testing.assert_allclose(actual, points)
+    assert_allclose(actual, points)
 
 
 def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):

@@ -15,6 +15,7 @@ import yaml
 from benchmarks import __main__ as bench
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers import forked_python
+from helpers.generators import seeded
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
@@ -50,7 +51,7 @@ def train(strategy: StructureAwareStrategy, steps: int) -> tuple[dict[str, Any],
     optimizers = adam(params)
     state = strategy.initialize_state(1.0)
     viewmats, Ks = camera(WIDTH, HEIGHT)
-    images = torch.rand((1, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(0))
+    images = torch.rand((1, HEIGHT, WIDTH, 3), generator=seeded(0))
     tensors = multiscale_structure_tensor(images)
     counts = []
     for step in range(steps):

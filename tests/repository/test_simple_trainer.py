@@ -85,4 +85,5 @@ def test_the_program_learns_its_photos(calls: list[int], capsys: pytest.CaptureF
     trained = simple_trainer.main("cpu", 48, 36, iterations=60)
     assert trained > untrained + 3
     assert max(calls) > calls[0]
-    assert re.search(r"^800 points became [\d,]+ Gaussians; PSNR \d+\.\d\d dB$", capsys.readouterr().out, re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert re.search(r"^800 points became [\d,]+ Gaussians; PSNR \d+\.\d\d dB$", printed, re.MULTILINE)

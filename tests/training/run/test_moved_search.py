@@ -184,7 +184,8 @@ def test_full_memory_ends_no_run(clean: Path, tmp_path: Path, monkeypatch, capsy
     put_region(trainer)
     trainer.train()
     assert trainer.pipeline.views.moved.views == [0]
-    assert "memory is too full to find what moved" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "memory is too full to find what moved" in printed
 
 
 @pytest.mark.hard_case("things that moved before photos of several sizes", "judged at each photo's own size")

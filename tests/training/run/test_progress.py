@@ -308,6 +308,7 @@ def test_a_run_on_the_cpu_says_that_it_is_slow_and_what_to_do_beside_other_work(
 ):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     set_up(config)
-    assert f"{cpu_notice(2)}\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{cpu_notice(2)}\n" in printed
     assert "put OMP_NUM_THREADS=1 before the command" in cpu_notice(2)
     assert "OMP_NUM_THREADS" not in cpu_notice(1)

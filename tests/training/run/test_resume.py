@@ -40,6 +40,7 @@ from nerfstudio.utils import writer
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers import forked_python, short_runs
 from helpers.kill_and_resume import configure, differences, set_up
+from helpers.refusals import refusal
 from helpers.small_scenes import ITERATIONS
 from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.errors import InputError, WriteError
@@ -495,7 +496,8 @@ def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
         trainer.train()
     timer.join()
     assert stopped.value.code == 130
-    assert "before an iteration was done; the same command starts again" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "before an iteration was done; the same command starts again" in printed
     assert checkpoints(trainer) == []
 
 
@@ -521,7 +523,8 @@ def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_er
     trainer.train()
     assert calls
     assert checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
-    assert "SIGINT" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "SIGINT" not in printed
 
 
 @pytest.mark.hard_case("a second Ctrl-C", "stops at once, as nerfstudio does; the previous checkpoint stays")
@@ -672,7 +675,7 @@ def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
     if goes_on:
         assert set_up(config)._start_step == ITERATIONS
     else:
-        with pytest.raises(InputError, match=r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
+        with refusal(r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
             set_up(config)
 
 
@@ -717,12 +720,12 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
     config.output_dir = tmp_path / "resumed"
     assert set_up(config)._start_step == 2
     config.pipeline.model.color_model = "none"
-    with pytest.raises(InputError, match=r"It optimized color_matrices, too: set pipeline\.model\.color-model "):
+    with refusal(r"It optimized color_matrices, too: set pipeline\.model\.color-model "):
         set_up(config)
     config.pipeline.model.color_model = "affine"
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")
-    with pytest.raises(InputError, match=r"\S+color_matrices is for 8 training views, and there are 10: set the"):
+    with refusal(r"\S+color_matrices is for 8 training views, and there are 10: set the"):
         set_up(config)
 
 
@@ -735,7 +738,8 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     pipeline = trainer.pipeline
     known = [path.name for path in pipeline.datamanager.train_dataset.image_filenames]
     positions = camera_positions(pipeline.datamanager.train_dataset.cameras)
-    assert "same cameras" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "same cameras" not in printed
     files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
     files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
     check_same_capture(pipeline, known, positions)
@@ -745,7 +749,8 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     )
     files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
     check_same_capture(pipeline, known, positions)
-    assert "same cameras" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "same cameras" not in printed
 
 
 # --- the cap that the device's memory gives ---
@@ -866,7 +871,8 @@ def test_damaged_checkpoints_alone_are_one_sentence(
     assert message.startswith(str(folder / "step-000000002.ckpt"))
     assert message.endswith("or train from scratch.")
     assert "\n" not in message
-    assert "Going on" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Going on" not in printed
 
 
 @pytest.mark.hard_case(

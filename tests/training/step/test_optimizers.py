@@ -13,6 +13,7 @@ import pytest
 import torch
 from gsplat.strategy.ops import remove
 from torch import Tensor
+from torch.testing import assert_close
 
 from sadgs_ns import kernels
 from sadgs_ns.training.step.nonfinite import NonFiniteLog
@@ -109,7 +110,7 @@ def assert_same(one: Training, other: Training, tolerance: float = 0.0) -> None:
         if value.is_cuda or tolerance:
             value = value.to(DEVICE)
             known = known.to(DEVICE)
-            torch.testing.assert_close({name: value}, {name: known}, atol=max(tolerance, 1e-7), rtol=tolerance or 2e-6)
+            assert_close({name: value}, {name: known}, atol=max(tolerance, 1e-7), rtol=tolerance or 2e-6)
         else:
             assert torch.equal(value, known), name
     assert not expected
