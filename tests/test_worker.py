@@ -53,7 +53,8 @@ def test_events_with_fields_are_heard_in_their_order_before_the_result(program):
     assert result == {"total": 7}
     steps = [("progress", {"stage": "adding", "done": i, "total": 3}) for i in range(3)]
     assert heard == [("begins", {"start": 4}), *steps]
-    assert [path.name for path in log.parent.glob("log*")] == ["log.txt"]
+    names = [path.name for path in log.parent.glob("log*")]
+    assert names == ["log.txt"]
 
 
 def test_without_a_listener_events_go_nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -116,7 +117,8 @@ def test_a_worker_ends_when_its_threads_and_what_is_due_at_its_exit_are_done(pro
         "    return 3\n"
     )
     with Worker("program:function", log, saves=True) as worker:
-        assert worker.run(on_event=print) == 3
+        status = worker.run(on_event=print)
+        assert status == 3
         assert log.read_text("utf8") == "written exit\n"
 
 

@@ -22,7 +22,7 @@ from benchmarks.run import build_config, describe
 from benchmarks.table import markdown
 from helpers.json_files import write_json
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -274,7 +274,7 @@ def some_jobs(labels: str = "abc") -> list[Job]:
 
 
 def test_results_are_written_and_done_runs_are_skipped(tmp_path: Path):
-    output = tmp_path / "out" / "results.jsonl"
+    output = tmp_path / "out/results.jsonl"
     log = tmp_path / "results.log"
     jobs = some_jobs()
     runner = FakeRunner(crashes={"b"})
@@ -352,7 +352,8 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
     assert processes[0].poll() is not None
     assert signal.getsignal(signal.SIGTERM) == before
     monkeypatch.setattr(bench, "launcher", lambda root: FakeRunner(crashes={"ours"}))
-    assert bench.main(arguments) == 1
+    status = bench.main(arguments)
+    assert status == 1
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -367,7 +368,8 @@ def test_runs_on_other_numbers_of_devices_are_not_mixed(
     results.append(output, result(devices=there))
     arguments = ["p.yaml", "--scenes", ".", "--output", str(output), "--gpus", gpus]
     monkeypatch.chdir(tmp_path)
-    assert bench.main(arguments) == 2
+    status = bench.main(arguments)
+    assert status == 2
     errors = capsys.readouterr().err
     assert f"and another --output than {output} if that has runs on others" in errors
 
@@ -380,7 +382,8 @@ def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, cap
         file.write('{"key": "b", "sta')
     results.append(path, {"key": "of no scene"})
     results.append(path, result(key="c"))
-    assert [r["key"] for r in results.read(path)] == ["a", "c"]
+    keys = [r["key"] for r in results.read(path)]
+    assert keys == ["a", "c"]
     said = capsys.readouterr().err
     assert "results.jsonl:2 is not a result" in said
     assert "results.jsonl:3 is not a result" in said
@@ -395,7 +398,8 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
         ([str(CONFIGS / "demo-gate.yaml"), "--only", "nothing"], "--only 'nothing' leaves no run"),
         ([str(CONFIGS / "demo-gate.yaml"), "--only", "["], "is not a regular expression"),
     ]:
-        assert bench.main([*arguments, *options]) == 2
+        status = bench.main([*arguments, *options])
+        assert status == 2
         errors = capsys.readouterr().err
         assert sentence in errors
 

@@ -166,7 +166,8 @@ def test_the_curve_ends_in_the_finished_run(runs: Runs):
     actual = [set(point) for point in points]
     expected = [{"step", "seconds", "psnr", "ssim", "lpips", "gaussians"}] * 3
     assert actual == expected
-    assert [point["step"] for point in points] == [5, 10, ITERATIONS]
+    steps = [point["step"] for point in points]
+    assert steps == [5, 10, ITERATIONS]
     actual = {name: record[name] for name in ("psnr", "ssim", "lpips", "gaussians")}
     expected = {name: points[-1][name] for name in ("psnr", "ssim", "lpips", "gaussians")}
     assert actual == expected
@@ -268,7 +269,7 @@ def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: P
     for row in (SPLATFACTO, SADGS):  # The order is that of the loader whose views are evaluated.
         datamanager: Any = run.build_config(SCENE, row, 0, root, tmp_path).pipeline.datamanager.setup(test_mode="test")
         for name, (_, batch) in zip(record["view_names"], datamanager.fixed_indices_eval_dataloader, strict=True):
-            photograph = np.asarray(Image.open(root / "demo" / "images" / f"{name}.png").convert("RGB"))
+            photograph = np.asarray(Image.open(root / "demo/images" / f"{name}.png").convert("RGB"))
             image = batch["image"].cpu().numpy()
             assert np.array_equal(image if image.dtype == np.uint8 else np.rint(image * 255), photograph)
         # Without SfM points the Gaussians' centres stand for them.
@@ -383,7 +384,7 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
         {"colmap_path": "sparse/0", "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 8},
     )
     job = Job(bonsai, Row("full", "sadgs-paper-indoor"), 0)
-    assert job.key in (Path(__file__).parents[2] / "docs" / "results" / "claims.jsonl").read_text()
+    assert job.key in (Path(__file__).parents[2] / "docs/results/claims.jsonl").read_text()
 
 
 @pytest.mark.parametrize("wrong", [0, -5, 1.5, "500", True])

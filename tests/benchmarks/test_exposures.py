@@ -20,10 +20,11 @@ def pixels(scene: Path, name: str) -> np.ndarray:
 
 
 def test_each_training_photo_has_the_gain_that_the_file_says_and_held_out_ones_the_mean(scene: Path, tmp_path: Path):
-    assert bench.main(["exposures", str(scene), str(tmp_path / "copy")]) == 0
+    status = bench.main(["exposures", str(scene), str(tmp_path / "copy")])
+    assert status == 0
     photos = read_json(tmp_path / "copy" / FILE)
     assert len(photos) == VIEWS
-    assert (tmp_path / "copy" / "sparse" / "0" / "points3D.bin").exists()
+    assert (tmp_path / "copy/sparse/0/points3D.bin").exists()
     held_out = [name for name, photo in photos.items() if photo["held_out"]]
     assert held_out == ["000.png", "004.png", "008.png"]
     gains = np.array([photo["gain"] for photo in photos.values() if not photo["held_out"]])
@@ -79,17 +80,18 @@ def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     (tmp_path / "copy").mkdir()
-    (tmp_path / "copy" / "kept").touch()
+    (tmp_path / "copy/kept").touch()
     for arguments, said in (
         ([str(tmp_path), str(tmp_path / "copy")], "holds no sparse/0"),
         ([str(scene), str(scene)], "is there and holds no exposures.json"),
         ([str(scene), str(tmp_path / "copy")], "is there and holds no exposures.json"),
         ([str(scene), str(tmp_path / "new"), "--spread", "0.5"], "--spread must be at least 1"),
     ):
-        assert bench.main(["exposures", *arguments]) == 2
+        status = bench.main(["exposures", *arguments])
+        assert status == 2
         error = capsys.readouterr().err
         assert said in error
         assert error.count("\n") == 1
-    assert (tmp_path / "copy" / "kept").exists()
+    assert (tmp_path / "copy/kept").exists()
     assert (scene / "images").is_dir()
     assert not (tmp_path / "new").exists()

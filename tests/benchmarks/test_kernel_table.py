@@ -254,7 +254,8 @@ def test_a_row_has_the_loop_relative_to_that_with_all_kernels():
 def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kernels():
     part = Part(JOB, {REFERENCE: None, "poses": TWINS["poses"]}, {}, is_short=True)
     measured = loop(poses=Measured({"densification": [1.0, 1.0], "after": [0.5, 0.5]}))
-    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
+    labels = [row["label"] for row in kernel_share.rows_of(part, measured)]
+    assert labels == ["poses"]
     part = dataclasses.replace(part, is_short=False)
     assert len(kernel_share.rows_of(part, measured)) == 2
     measured.about["devices"] = 2
@@ -333,9 +334,11 @@ def test_the_command_writes_a_row_for_each_kernel(
     output = tmp_path / "kernels.jsonl"
     words = ["kernels", str(tmp_path / "mine.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
     words += ["--only", "demo", "--rounds", "1", "--kernels", "adam", "poses", "quantization"]
-    assert bench.main(words) == 0, capsys.readouterr().err
+    status = bench.main(words)
+    assert status == 0, capsys.readouterr().err
     rows = results.read(output)
-    assert [row["label"] for row in rows] == [REFERENCE, "adam", "quantization", "poses"]
+    labels = [row["label"] for row in rows]
+    assert labels == [REFERENCE, "adam", "quantization", "poses"]
     for row in rows:
         assert row["status"] == "ok"
         assert row["ratio"] > 0
@@ -360,7 +363,8 @@ def test_unknown_names_are_refused_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(PROTOCOL)
     given = ["kernels", "mine.yaml", "--scenes", ".", "--output", "rows.jsonl", *words]
-    assert bench.main(given) == 2
+    status = bench.main(given)
+    assert status == 2
     errors = capsys.readouterr().err
     assert f"python -m benchmarks kernels: {sentence}" in errors
     assert not Path("rows.jsonl").exists()

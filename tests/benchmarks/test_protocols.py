@@ -20,7 +20,7 @@ from benchmarks.datasets import check, image_names
 from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 OTHERS = ("captures", "chain", "disturbed-cameras", "placing", "seconds")
 """The description of the captures, and protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
 PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OTHERS)
@@ -267,7 +267,7 @@ def test_without_a_factor_the_folder_is_the_one_that_nerfstudio_would_choose(tmp
 
 def test_what_is_missing_in_a_scene_is_named(tmp_path: Path):
     folder = colmap_scene(tmp_path / "garden")
-    (folder / "images_4" / "b.jpg").unlink()
+    (folder / "images_4/b.jpg").unlink()
     with pytest.raises(FileNotFoundError, match=r"garden/images_4 lacks 1 of 2 images, such as b\.jpg"):
         names_of(OPTIONS, folder)
     with pytest.raises(FileNotFoundError, match="garden/sparse holds no COLMAP model"):
@@ -291,9 +291,10 @@ def test_another_order_of_the_images_is_told(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_the_command_says_what_is_missing_before_it_runs_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    output = tmp_path / "out" / "results.jsonl"
+    output = tmp_path / "out/results.jsonl"
     command = [str(CONFIGS / "mipnerf360.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
-    assert bench.main(command) == 2
+    status = bench.main(command)
+    assert status == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     assert f"{tmp_path / 'bicycle'} does not exist" in said

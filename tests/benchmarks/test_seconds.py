@@ -108,7 +108,7 @@ def test_the_parts_of_a_command_are_measured_once(tmp_path: Path, capsys: pytest
     assert {name for process, name in names if process == "COLMAP"} >= {"imports", "features", "placing"}
     for _, _, begin, end in measured["parts"]:
         assert 0 <= begin <= end <= measured["seconds"]
-    assert (tmp_path / "plots" / "corner-new.png").exists()
+    assert (tmp_path / "plots/corner-new.png").exists()
     written = (tmp_path / "rows.jsonl").read_bytes()
     assert measure() == 0  # There is nothing left to do.
     assert (tmp_path / "rows.jsonl").read_bytes() == written

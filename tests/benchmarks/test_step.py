@@ -29,7 +29,8 @@ def test_without_a_gpu_one_sentence_says_what_it_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
-    assert bench.main(["step"]) == 2
+    status = bench.main(["step"])
+    assert status == 2
     told = "python -m benchmarks step: this needs a CUDA device, and torch finds none.\n"
     assert capsys.readouterr() == ("", told)
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,8 @@ from helpers.small_scenes import VIEWS
 
 
 def test_a_colmap_scene_is_split_as_nerfstudio_then_reads_it(scene: Path, tmp_path: Path):
-    assert bench.main(["validation", str(scene.parent), str(tmp_path)]) == 0
+    status = bench.main(["validation", str(scene.parent), str(tmp_path)])
+    assert status == 0
     names = image_names(ColmapDataParserConfig(colmap_path=SPARSE, downscale_factor=1), scene)
     parser = ColmapDataParserConfig(data=tmp_path / scene.name, colmap_path=SPARSE, downscale_factor=1).setup()
     read = {}
@@ -44,7 +45,8 @@ def test_each_fold_holds_out_its_views_and_only_fold_0_holds_out_test_views(scen
 
 @pytest.mark.parametrize("folds", ["8", "-1", "2,x", ""])
 def test_a_fold_that_there_is_not_is_refused(folds: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert bench.main(["validation", str(tmp_path), str(tmp_path), f"--folds={folds}"]) == 2
+    status = bench.main(["validation", str(tmp_path), str(tmp_path), f"--folds={folds}"])
+    assert status == 2
     told = (
         f"python -m benchmarks validation: --folds must be whole numbers from 0 to 7, such as 2,4,6, not {folds!r}.\n"
     )
@@ -74,7 +76,7 @@ def test_noise_turns_training_cameras_about_their_centres_and_leaves_the_others(
 
 
 def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
-    scene = tmp_path / "scenes" / "listed"
+    scene = tmp_path / "scenes/listed"
     scene.mkdir(parents=True)
     names = [f"{i:02}.png" for i in range(24)]
     for name in names:
@@ -99,6 +101,7 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
 
 
 def test_a_folder_without_scenes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert bench.main(["validation", str(tmp_path), str(tmp_path / "out")]) == 2
+    status = bench.main(["validation", str(tmp_path), str(tmp_path / "out")])
+    assert status == 2
     errors = capsys.readouterr().err
     assert f": {tmp_path} holds no folder with sparse/0 or transforms.json; give" in errors

@@ -186,7 +186,7 @@ def test_given_cameras_on_which_an_earlier_version_trained_stay_divided(given: P
     work = PhotosToSplat(Sadgs(given, out, formats="ply"), [], Console(quiet=True))
     assert work.given is not None
     settings = Settings(str(given.resolve()), work.given.describe(), 1600, 1.0, [], files=work.given.stamp_images())
-    checkpoints = out / "training" / "sadgs" / "run" / "nerfstudio_models"
+    checkpoints = out / "training/sadgs/run/nerfstudio_models"
     checkpoints.mkdir(parents=True)
     settings.write(out / "settings.json")
     assert train_command(given, out, False)[-1] == "1", "nothing is trained yet"

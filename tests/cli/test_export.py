@@ -74,7 +74,7 @@ def write_run(folder: Path, params: dict[str, torch.Tensor], transform: Any = No
     (folder / "config.yml").write_text("!!python/object/apply:os.abort []")  # nobody may read it
     pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
     state = {"step": 7, "pipeline": pipeline, "optimizers": {}, "scalers": {}}
-    torch.save(state, folder / "nerfstudio_models" / "step-000000007.ckpt")
+    torch.save(state, folder / "nerfstudio_models/step-000000007.ckpt")
     if transform is not None:
         noted = {"transform": np.asarray(transform).tolist(), "scale": scale}
         write_json(folder / "dataparser_transforms.json", noted)
@@ -469,9 +469,11 @@ def test_a_page_opens_at_the_training_camera_in_the_middle_and_has_the_capture_s
     page = b'<title>Viewer</title>\n<script type="application/json" id="sse-bootstrap">{"settings": {}}</script>'
     monkeypatch.setattr(html, "_page", lambda: page)
     command = [str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "splat.html")]
-    assert export.main([*command, "--title", "My room"]) == 0
+    status = export.main([*command, "--title", "My room"])
+    assert status == 0
     assert (tmp_path / "splat.html").read_text().startswith("<title>My room</title>")
-    assert export.main(command) == 0
+    status = export.main(command)
+    assert status == 0
     title, line = (tmp_path / "splat.html").read_text().splitlines()
     capture = trainer.config.pipeline.datamanager.dataparser.data
     assert title == f"<title>{capture.name}</title>"
@@ -508,10 +510,12 @@ def test_a_capture_that_cannot_be_read_is_named(tmp_path: Path, capsys: pytest.C
     run = write_run(tmp_path / "run", gaussians(3))
     (tmp_path / "empty").mkdir()
     options = [str(run), "--output", str(tmp_path / "a.html"), "--data", str(tmp_path / "empty")]
-    assert export.main(options) == 2
+    status = export.main(options)
+    assert status == 2
     errors = capsys.readouterr().err
     assert re.fullmatch(r"sadgs-export: .*empty.*\.\n", errors)
-    assert export.main([*options, "--frame", "colmap"]) == 2
+    status = export.main([*options, "--frame", "colmap"])
+    assert status == 2
     errors = capsys.readouterr().err
     assert errors.startswith("sadgs-export: --frame colmap is for files that other programs read: ")
 
@@ -587,7 +591,7 @@ def test_the_run_is_its_folder_its_config_or_a_checkpoint_and_the_latest_is_take
 
 def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run = write_run(tmp_path / "run", gaussians(3))
-    (run / "nerfstudio_models" / "step-000000011.ckpt").write_bytes(b"half")
+    (run / "nerfstudio_models/step-000000011.ckpt").write_bytes(b"half")
     assert export.export(Export(run, tmp_path / "a.ply")) == 3
     printed = " ".join(capsys.readouterr().out.split())
     assert "step-000000011.ckpt is cut off, damaged" in printed
@@ -626,7 +630,7 @@ def test_errors_are_one_sentence_and_leave_nothing(
     transform[0, 1] = {"shear": 0.1, "nan": np.nan}.get(case, 0.0)
     transform[0, 3] = 1e8 if case == "far" else 0.0
     run = write_run(tmp_path / "run", params, None if case == "no transform" else transform)
-    checkpoint = run / "nerfstudio_models" / "step-000000007.ckpt"
+    checkpoint = run / "nerfstudio_models/step-000000007.ckpt"
     if case == "not json":
         (run / "dataparser_transforms.json").write_text("{")
     if case == "no checkpoint":
@@ -652,7 +656,8 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path: Path, capsys: pyte
     output.write_text("earlier")
     partial = tmp_path / ".a.partial.ply"
     partial.symlink_to("/dev/full")
-    assert export.main([str(run), "--output", str(output)]) == 2
+    status = export.main([str(run), "--output", str(output)])
+    assert status == 2
     errors = capsys.readouterr().err
     assert "a.ply could not be written (No space left on device; " in errors
     assert output.read_text() == "earlier"

@@ -57,7 +57,8 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     assert actual == [str(path) for path in files]
 
     arguments = ["--output", str(tmp_path / "splat.ply"), "--cameras", str(file), "--frame", "colmap"]
-    assert export.main([str(run), *arguments]) == 0
+    status = export.main([str(run), *arguments])
+    assert status == 0
     to_run = from_data(run.with_name("dataparser_transforms.json"))
     back = torch.from_numpy(to_run.poses(written_poses(file).double().numpy())).float()
     assert_within(back, expected, 5e-6)
@@ -65,7 +66,7 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
 
 def test_training_on_the_written_cameras_begins_where_the_run_ended(scene: Path, tmp_path: Path):
     run, trainer = run_of(scene, tmp_path, "refined")
-    file = tmp_path / "again" / "transforms.json"
+    file = tmp_path / "again/transforms.json"
     status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
     assert status == 0
     parser = NerfstudioDataParserConfig(data=file, eval_mode="all", downscale_factor=1)

@@ -93,7 +93,8 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
     size = ["--voxel-size", str(voxel * MOVED.scale)]
     for frame in ("colmap", "nerfstudio"):
         path = tmp_path / f"{frame}.mesh.ply"
-        assert command(run, path, *size, "--frame", frame) == 0
+        status = command(run, path, *size, "--frame", frame)
+        assert status == 0
         found = PlyData.read(str(path))
         said = rf"{path}: {found['face'].count:,} triangles fused from rendered depth, .* in the frame of {frame}\n"
         printed = capsys.readouterr().out
@@ -116,7 +117,8 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
         colors = in_room.visual.vertex_colors[in_room.faces[on, 0], :3] / 255  # type: ignore[union-attr]
         errors = np.abs(ROOM[index].colour(in_room.vertices[in_room.faces[on, 0]]) - colors)
         assert np.median(errors) < 0.15
-    assert {path.name for path in tmp_path.iterdir()} == {"colmap.mesh.ply", "nerfstudio.mesh.ply"}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"colmap.mesh.ply", "nerfstudio.mesh.ply"}
 
 
 @pytest.mark.usefixtures("open3d")
@@ -143,10 +145,12 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
 def test_what_is_cleaned_away_is_not_in_the_mesh(run: tuple[Path, Path], tmp_path: Path):
     whole = tmp_path / "whole.mesh.ply"
     cut = tmp_path / "cut.mesh.ply"
-    assert command(run, whole) == 0
+    status = command(run, whole)
+    assert status == 0
     vertices = trimesh.load(whole, process=False).vertices  # type: ignore[union-attr]
     middle = float(np.median(vertices[:, 0]))
-    assert command(run, cut, "--crop", f"{middle}", "-9", "-9", "9", "9", "9") == 0
+    status = command(run, cut, "--crop", f"{middle}", "-9", "-9", "9", "9", "9")
+    assert status == 0
     left = trimesh.load(cut, process=False).vertices  # type: ignore[union-attr]
     assert len(left) > 100
     assert left[:, 0].min() > middle - 3 * SPACING * MOVED.scale
@@ -193,7 +197,8 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
 def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
     run: tuple[Path, Path], options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert command(run, tmp_path / "a.mesh.ply", *options.split()) == 2
+    status = command(run, tmp_path / "a.mesh.ply", *options.split())
+    assert status == 2
     errors = capsys.readouterr().err
     assert re.fullmatch(f"sadgs-export: {sentence}\n", errors)
     assert not list(tmp_path.iterdir())
@@ -216,12 +221,14 @@ def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Pa
 def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     run: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    assert command(run, tmp_path / "a.ply", "--voxel-size", "0.1") == 2
+    status = command(run, tmp_path / "a.ply", "--voxel-size", "0.1")
+    assert status == 2
     said = "sadgs-export: --voxel-size is for meshes: let --output end in .mesh.ply, or leave it out.\n"
     errors = capsys.readouterr().err
     assert errors == said
     monkeypatch.setitem(sys.modules, "open3d", None)  # Importing it fails.
-    assert command(run, tmp_path / "a.mesh.ply") == 2
+    status = command(run, tmp_path / "a.mesh.ply")
+    assert status == 2
     remedy = "install open3d and libusb-package with pip"
     said = rf"sadgs-export: A mesh is made by open3d, which cannot be imported \(.*\): {remedy}\.\n"
     errors = capsys.readouterr().err

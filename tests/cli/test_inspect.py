@@ -124,7 +124,8 @@ def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_
 
 
 def wrong(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    assert inspect.main(arguments) == 2
+    status = inspect.main(arguments)
+    assert status == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     return lines[0]
@@ -164,10 +165,11 @@ def test_a_run_and_its_capture_may_have_moved(
     config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path(
         "scene"
     )  # as trained elsewhere
-    (tmp_path / "moved" / "config.yml").write_text(yaml.dump(config))
+    (tmp_path / "moved/config.yml").write_text(yaml.dump(config))
     monkeypatch.chdir(tmp_path)
     assert "scene does not exist: give --data" in wrong(["moved"], capsys)
-    assert inspect.main(["moved", "--data", str(scene)]) == 0
+    status = inspect.main(["moved", "--data", str(scene)])
+    assert status == 0
     assert len(list(Path("moved/inspect").iterdir())) == 6
 
 
@@ -175,7 +177,7 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     shutil.copytree(run.parent, tmp_path / "run")
-    folder = tmp_path / "run" / "nerfstudio_models"
+    folder = tmp_path / "run/nerfstudio_models"
     latest = max(folder.iterdir())
     state = torch.load(latest, weights_only=True)
     means = state["pipeline"].pop("_model.gauss_params.means")
@@ -196,7 +198,7 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     torch.save(state, latest)
     config = yaml.load(run.read_text(), Loader=yaml.Loader)
     config.pipeline.model.poses = "refined"
-    (tmp_path / "run" / "config.yml").write_text(yaml.dump(config))
+    (tmp_path / "run/config.yml").write_text(yaml.dump(config))
     line = wrong([str(tmp_path / "run")], capsys)
     assert f"{latest} does not fit its run: The checkpoint's _model.poses.table" in line
     assert line.endswith(remedy)

@@ -234,7 +234,7 @@ def test_masks_are_read_by_the_names_in_use(called: str, scene: Path, tmp_path: 
     "refused: says which folder to give, or which command makes one",
 )
 def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tmp_path: Path):
-    data = tmp_path / "above" / "capture"
+    data = tmp_path / "above/capture"
     shutil.copytree(scene, data)
     (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
     (data / "other").mkdir()
@@ -260,7 +260,8 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
 def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path):
     data = tmp_path / ("a" * 300)
     sentence = f"{data} cannot be read (File name too long): correct its name or rights."
-    assert [finding.sentence for finding in check_data(data)] == [sentence]
+    sentences = [finding.sentence for finding in check_data(data)]
+    assert sentences == [sentence]
     with pytest.raises(InputError) as refused:
         check_capture(SadgsDatamanagerConfig(data=data))
     assert str(refused.value) == sentence
@@ -428,7 +429,8 @@ def test_masks_without_smaller_copies_are_told(tmp_path: Path, monkeypatch: pyte
         check_capture(SadgsDatamanagerConfig(data=tmp_path))
     config = parsed(*str(refused.value).split("`")[1].split())
     config.data = tmp_path
-    assert {finding.severity for finding in check_capture(config)} == {"note"}
+    severities = {finding.severity for finding in check_capture(config)}
+    assert severities == {"note"}
 
 
 @pytest.mark.hard_case(

@@ -951,7 +951,8 @@ def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
     assert not (tmp_path / "out").exists()
     monkeypatch.setattr(doctor, "check_machine", lambda: [])
     capsys.readouterr()
-    assert doctor.main([str(data)]) == 1
+    status = doctor.main([str(data)])
+    assert status == 1
     printed = capsys.readouterr().out
     assert f"error: {refused.value}" in printed
 

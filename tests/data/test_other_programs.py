@@ -154,12 +154,12 @@ def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
 def test_names_of_masks_are_mended_as_those_of_images(name: str, write: Callable[..., Path]):
     data = write(of_frame=lambda frame: frame.update(mask_path=name))
     (data / "masks").mkdir()
-    Image.new("L", (WIDTH, HEIGHT), 255).save(data / "masks" / "0.png")
+    Image.new("L", (WIDTH, HEIGHT), 255).save(data / "masks/0.png")
     (told,) = [finding.sentence for finding in check_data(data) if finding.sentence.endswith(" masks.")]
     assert re.search(r" with (\d+) masks\.$", told)
     config = NerfstudioDataParserConfig(data=data)
     config._target = TransformsParser
-    assert {*config.setup().get_dataparser_outputs().mask_filenames} == {data / "masks" / "0.png"}
+    assert {*config.setup().get_dataparser_outputs().mask_filenames} == {data / "masks/0.png"}
 
 
 @pytest.mark.hard_case(
@@ -368,7 +368,7 @@ ProcessPolycam(data=Path({str(data)!r}), output_dir=Path({str(tmp_path / "out")!
 @pytest.mark.hard_case("poses of LLFF (`poses_bounds.npy`) or in a `capture.json`", "the file is named: it is not read")
 @pytest.mark.parametrize("name", ["poses_bounds.npy", "capture.json"])
 def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path, tmp_path: Path):
-    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    shutil.copytree(captures / "transforms/images", tmp_path / "images")
     (tmp_path / name).touch()
     computing = f"`sadgs-process {tmp_path}/images FOLDER` computes others"
     problem = f"{tmp_path / name} may have poses, but in a format that is not read"
@@ -401,7 +401,7 @@ def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path,
 def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
     file: str, content: str, command: str, captures: Path, tmp_path: Path
 ):
-    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    shutil.copytree(captures / "transforms/images", tmp_path / "images")
     (tmp_path / file).write_text("")
     assert poses_elsewhere(tmp_path) is None
     (tmp_path / file).write_text(content)

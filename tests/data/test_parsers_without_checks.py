@@ -35,7 +35,7 @@ OTHERS = {name: parser for name, parser in all_dataparsers.items() if type(parse
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_folder_that_a_parser_cannot_read_is_refused_before_a_run_begins(name: str, tmp_path: Path):
     (tmp_path / "data").mkdir()
-    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "data" / "a.png")
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "data/a.png")
     parser: Any = copy.deepcopy(OTHERS[name])
     parser.data = tmp_path / "data"
     config = configure(tmp_path / "out", parser)
@@ -72,7 +72,7 @@ def test_a_scene_that_moves_is_told_of_other_parsers_too(times: list[float], num
 
 @pytest.mark.hard_case("`nerfosr-data`, whose parser names files by texts", "trains")
 def test_names_of_files_may_be_texts(tmp_path: Path):
-    scene = tmp_path / "data" / "stjacob" / "final"
+    scene = tmp_path / "data/stjacob/final"
     described = frames(tmp_path / "drawn", [(WIDTH, HEIGHT)])
     for index, frame in enumerate(described):
         split = scene / ["validation", "test", "train"][min(index // 2, 2)]

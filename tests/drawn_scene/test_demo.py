@@ -142,7 +142,8 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     ).setup()
     train = parser.get_dataparser_outputs("train")
     held_out = parser.get_dataparser_outputs("val")
-    assert [path.name for path in held_out.image_filenames] == ["000.png", "008.png"]
+    names = [path.name for path in held_out.image_filenames]
+    assert names == ["000.png", "008.png"]
     assert len(train.image_filenames) == VIEWS - 2
     with Image.open(train.image_filenames[0]) as image:
         assert image.size == (WIDTH, HEIGHT)
@@ -214,8 +215,10 @@ def test_foreign_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
         write_scene(tmp_path, WIDTH, HEIGHT, VIEWS)
     with pytest.raises(FileExistsError, match="is a file"):
         write_scene(tmp_path / "thesis.tex", WIDTH, HEIGHT, VIEWS)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    assert demo_scene.main([str(tmp_path)]) == 2
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["thesis.tex"]
+    status = demo_scene.main([str(tmp_path)])
+    assert status == 2
     errors = capsys.readouterr().err
     assert errors.startswith("error: ")
 
@@ -234,7 +237,8 @@ def test_an_earlier_scene_is_replaced_and_a_failed_one_leaves_nothing(
     monkeypatch.setattr(demo_scene, "_write_colmap", fail)
     with pytest.raises(OSError, match="no space left"):
         write_scene(folder, 16, 16, 12, points=10)
-    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["scene"]
     assert len(list((folder / "images").iterdir())) == 9
 
 
@@ -254,7 +258,7 @@ def gaussians(count: int, bands: int) -> dict[str, Any]:
 @pytest.mark.parametrize("bands", [0, 15])
 def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     params = gaussians(7, bands)
-    path = tmp_path / "new folder" / "splat.ply"
+    path = tmp_path / "new folder/splat.ply"
     assert write_gaussians(path, params) == 7
     vertex = PlyData.read(str(path))["vertex"]
     columns = [p.name for p in vertex.properties]
@@ -313,7 +317,8 @@ def test_demo_refuses_too_few_iterations(tmp_path: Path, capsys: pytest.CaptureF
     with quiet_import():
         from examples.drawn_scene.__main__ import main
 
-    assert main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"]) == 2
+    status = main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"])
+    assert status == 2
     errors = capsys.readouterr().err
     assert errors == "error: --max-num-iterations is 3; give at least 30, or nothing is split\n"
     assert not (tmp_path / "out").exists()

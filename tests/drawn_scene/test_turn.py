@@ -61,7 +61,8 @@ def test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians(tmp_path: 
     pipeline = SimpleNamespace(model=Model(), datamanager=SimpleNamespace(train_dataset=dataset))
     options = turn.Turn(Path("run"), tmp_path / "turn.webp", frames=3, width=40, shrink=2.0)
     pictures = turn.draw(pipeline, options)  # type: ignore[arg-type]
-    assert [picture.shape for picture in pictures] == [(30, 80, 3)] * 3
+    shapes = [picture.shape for picture in pictures]
+    assert shapes == [(30, 80, 3)] * 3
     assert pictures[0][0, 0].tolist() == [102] * 3 and pictures[0][0, 79].tolist() == [101] * 3
     for name in ("scales", "opacities"):
         assert pipeline.model.gauss_params[name].abs().max() < 1e-6
@@ -76,7 +77,8 @@ def test_the_file_moves_and_begins_again(name: str, tmp_path: Path):
         image.seek(1)
         image.load()
         assert image.info["duration"] == 200
-    assert [path.name for path in tmp_path.iterdir()] == [name]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == [name]
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,8 @@ def test_wrong_input_is_refused_in_a_sentence(
     words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
-    assert turn.main(["run", *words]) == 2
+    status = turn.main(["run", *words])
+    assert status == 2
     errors = capsys.readouterr().err
     assert sentence in errors
     assert not list(tmp_path.iterdir())

@@ -220,7 +220,8 @@ def test_positions_of_spz_are_as_fine_as_the_furthest_one_leaves(tmp_path: Path)
     written.means[0, 0] = 1e6
     with refusal(r"^The Gaussians reach 1,000,000 units .*: take the far ones away with --crop"):
         formats.write(tmp_path / "far.spz", written)
-    assert [path.name for path in tmp_path.iterdir()] == ["splat.spz"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["splat.spz"]
 
 
 @pytest.mark.hard_case(

@@ -27,7 +27,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache without the program, and an npm that needs no network."""
     put_node_into_path(tmp_path / "programs", "", NPM, monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "sadgs_ns"
+    return tmp_path / "cache/sadgs_ns"
 
 
 def test_the_lock_file_pins_every_package_by_its_hash_and_names_no_server():

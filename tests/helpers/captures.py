@@ -47,7 +47,7 @@ def write_capture(layout: str, folder: Path, scene: Path) -> Capture:
     elif layout != "sparse/0":
         shutil.rmtree(folder / "images")
         nerfstudio_data(folder)
-    mask = folder / "masks" / "000.png"
+    mask = folder / "masks/000.png"
     mask.parent.mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
     if cameras.name == "transforms.json":

@@ -288,7 +288,8 @@ def test_no_gaussians_have_no_rows(per_axis_radii: bool, monkeypatch: Any):
     radii, *found = by_the_kernel(scene, WIDTH, HEIGHT)
     assert radii.shape == ((2, 0, 2) if per_axis_radii else (2, 0))
     expected = [(2, 0, 2), (2, 0), (2, 0, 3)]
-    assert [output.shape for output in found] == expected
+    shapes = [output.shape for output in found]
+    assert shapes == expected
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

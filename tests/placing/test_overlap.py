@@ -203,7 +203,7 @@ def test_images_are_undistorted_while_the_model_is_written_and_again_after_an_in
     writer: Future[ModuleType] = Future()
     writer.set_result(importlib.import_module("nerfstudio.process_data.colmap_utils"))
     monkeypatch.setattr(reconstruct, "begin_imports", lambda: (future_of(torch.device("cpu")), writer))
-    model = tmp_path / "work" / "model"
+    model = tmp_path / "work/model"
     model.parent.mkdir()
     had_model = []
     begin = Undistortion.begin
@@ -225,7 +225,7 @@ def test_images_are_undistorted_while_the_model_is_written_and_again_after_an_in
     assert had_model == [False, True]
     theirs = tmp_path / "theirs"
     theirs.mkdir()
-    writer.result().colmap_to_json(undistorted / "sparse" / "0", theirs)
+    writer.result().colmap_to_json(undistorted / "sparse/0", theirs)
     for file in ("transforms.json", "sparse_pc.ply"):
         assert (undistorted / file).read_bytes() == (theirs / file).read_bytes()
     assert {file: (undistorted / file).read_bytes() for file in files} == written

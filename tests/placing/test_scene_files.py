@@ -37,7 +37,7 @@ def test_the_files_are_those_of_nerfstudio(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(scene_files, "_AT_ONCE", 30)
     model = model_of(num_cameras, 100)
     model.delete_point3D(50)
-    sparse = tmp_path / "theirs" / "sparse"
+    sparse = tmp_path / "theirs/sparse"
     sparse.mkdir(parents=True)
     model.write(sparse)
     colmap_to_json(sparse, tmp_path / "theirs")

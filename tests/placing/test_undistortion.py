@@ -98,13 +98,14 @@ def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Pa
         images.write_model(made)
         images.wait()
     assert asked == [(90, 60), (60, 90)]
-    model = pycolmap.Reconstruction(tmp_path / "undistorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(tmp_path / "undistorted/sparse/0")
     options = pycolmap.UndistortCameraOptions()
     for camera_id, camera in cameras.items():
         expected = pycolmap.undistort_camera(options, camera)
         assert model.cameras[camera_id].params.tolist() == expected.params.tolist()
-    written = sorted((tmp_path / "undistorted" / "images").iterdir())
-    assert [file.name for file in written] == ["1.png", "2.png", "3.png", "4.png"]
+    written = sorted((tmp_path / "undistorted/images").iterdir())
+    names = [file.name for file in written]
+    assert names == ["1.png", "2.png", "3.png", "4.png"]
     for file in written:
         camera = cameras[made.images[int(file.stem)].camera_id]
         warp = warp_of(camera, options)
@@ -128,7 +129,7 @@ def model_of_photos(folder: Path, number: int) -> pycolmap.Reconstruction:
 
 def test_a_photo_that_is_gone_is_named_when_the_model_is_written(tmp_path: Path):
     made = model_of_photos(tmp_path / "photos", 3)
-    (tmp_path / "photos" / "2.png").unlink()
+    (tmp_path / "photos/2.png").unlink()
     with undistortion.Undistortion(tmp_path / "photos", tmp_path / "model", 0, ()) as images:
         images.begin(made)
         images.write_model(made)
@@ -152,7 +153,7 @@ def test_images_that_are_not_begun_are_dropped_where_the_files_fail(tmp_path: Pa
         images.begin(made)
         threading.Timer(0.2, goes_on.set).start()
         raise OSError("full")
-    assert len(list((tmp_path / "undistorted" / "images").glob("*.png"))) <= 1
+    assert len(list((tmp_path / "undistorted/images").glob("*.png"))) <= 1
 
 
 def test_keypoints_of_the_model_move_with_the_images():

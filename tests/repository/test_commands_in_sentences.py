@@ -432,7 +432,8 @@ def test_the_doctor_s_next_command_reads_the_data(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(doctor, "check_machine", lambda: iter([]))
-    assert doctor.main([str(data)]) == 0
+    status = doctor.main([str(data)])
+    assert status == 0
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("Next: "))
     config = read_options(words[2:])
     manager: Any = config.pipeline.datamanager

@@ -87,7 +87,8 @@ def test_it_trains_resumes_and_exports(
         for name, value in model.gauss_params.items():
             assert torch.equal(again.pipeline.model.gauss_params[name], value), name
     path = tmp_path / "splat.ply"
-    assert export.main([str(whole.base_dir), "--output", str(path)]) == 0
+    status = export.main([str(whole.base_dir), "--output", str(path)])
+    assert status == 0
     assert f"element vertex {model.num_points}\n".encode() in path.read_bytes()
 
 

@@ -20,7 +20,7 @@ def test_options_are_read_as_pyyaml_s_full_loader_reads_them():
 
 @pytest.mark.parametrize("run", sorted(OLD_RUNS.iterdir()), ids=lambda run: run.name)
 def test_options_of_earlier_versions_are_read_too(run: Path):
-    text = (run / "run" / "config.yml").read_text("utf8")
+    text = (run / "run/config.yml").read_text("utf8")
     expected = yaml.load(text, Loader=yaml.Loader)
     assert yaml.dump(yaml.load(text, Loader=ConfigLoader)) == yaml.dump(expected)
 

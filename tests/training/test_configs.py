@@ -397,7 +397,7 @@ def test_an_installation_holds_every_module_and_nothing_that_measures(tmp_path: 
     (source / "pyproject.toml").write_text("\n".join(line for line in lines if not line.startswith("license")))
     build = python(f"import setuptools; setuptools.setup(script_args=['build_py', '-d', {str(installed)!r}])", source)
     assert build.returncode == 0, build.stderr
-    assert (installed / "sadgs_ns" / "py.typed").is_file()
+    assert (installed / "sadgs_ns/py.typed").is_file()
     modules = {path.relative_to(CHECKOUT) for path in CHECKOUT.glob("sadgs_ns/**/*.py")}
     assert {path.relative_to(installed) for path in installed.glob("**/*.py")} == modules
 
@@ -430,9 +430,10 @@ def test_everything_imported_is_required_by_us_or_by_nerfstudio():
 
 
 def test_continuous_integration_runs_what_ci_run_does_on_every_python():
-    workflow = yaml.safe_load((CHECKOUT / ".github" / "workflows" / "tests.yml").read_text())
+    workflow = yaml.safe_load((CHECKOUT / ".github/workflows/tests.yml").read_text())
     job = workflow["jobs"]["tests"]
-    assert [step["run"] for step in job["steps"] if "run" in step] == [".ci/run"]
+    runs = [step["run"] for step in job["steps"] if "run" in step]
+    assert runs == [".ci/run"]
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
     named = [line.rpartition(" ")[2] for line in project["classifiers"] if re.search(r":: 3\.\d+$", line)]
     assert job["strategy"]["matrix"]["python-version"] == named == ["3.10", "3.11", "3.12", "3.13"]

@@ -80,7 +80,7 @@ def finished(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         patched.delenv("TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD", raising=False)
         patched.setattr(sys, "argv", command)
         entrypoint()
-    return output / "room" / "sadgs" / "run"
+    return output / "room/sadgs/run"
 
 
 def test_ns_train_leaves_one_checkpoint_of_the_last_iteration_that_loads_safely(finished: Path):
@@ -511,7 +511,8 @@ def test_a_save_that_fails_leaves_the_previous_checkpoint_alone(
     monkeypatch.setattr(torch, "save", full_disk)
     with pytest.raises(OSError, match="no space left"):
         trainer.save_checkpoint(2)
-    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
+    names = [path.name for path in trainer.checkpoint_dir.iterdir()]
+    assert names == ["step-000000001.ckpt"]
     assert list(tmp_path.rglob("*.partial")) == []
     assert checkpoint(trainer, 1)["step"] == 1
 

@@ -204,10 +204,11 @@ def test_a_legend_has_the_scale_s_colours_and_numbers_as_an_image_in_its_text():
 
 def test_figures_are_written_whole_with_all_panels(tmp_path: Path):
     panels = [Panel("a", np.zeros((20, 30, 3), np.uint8), PERIOD), Panel("b", np.zeros((20, 30, 3), np.uint8))] * 2
-    color_scales.draw(tmp_path / "new" / "four.png", panels, columns=2)
+    color_scales.draw(tmp_path / "new/four.png", panels, columns=2)
     color_scales.draw(tmp_path / "one.png", panels[:1], columns=1)
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["four.png"]
-    with Image.open(tmp_path / "new" / "four.png") as four, Image.open(tmp_path / "one.png") as one:
+    names = [path.name for path in (tmp_path / "new").iterdir()]
+    assert names == ["four.png"]
+    with Image.open(tmp_path / "new/four.png") as four, Image.open(tmp_path / "one.png") as one:
         assert four.height > one.height > 0
 
 

@@ -296,10 +296,11 @@ def test_an_output_folder_that_cannot_be_made_is_named_before_anything_is_writte
     config: SadgsTrainerConfig, tmp_path: Path
 ):
     (tmp_path / "file").write_text("in the way")
-    config.output_dir = tmp_path / "file" / "out"
+    config.output_dir = tmp_path / "file/out"
     with pytest.raises(WriteError, match=r"/file/out/\S+/config\.yml could not be written \(Not a directory; .*name "):
         config.save_config()
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["file"]
 
 
 @pytest.mark.hard_case("the name of a folder is longer than the file system allows", "refused")
@@ -338,7 +339,8 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
         WriteError, match=r"^\S+/step-000000005\.ckpt could not be written \(.+\): make room or [^\n]+\.$"
     ):
         trainer.train()
-    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000001.ckpt"]
+    names = [path.name for path in trainer.checkpoint_dir.iterdir()]
+    assert names == ["step-000000001.ckpt"]
     assert differences(checkpoint(trainer, 1), before) == []
     assert list(config.output_dir.rglob("*.partial")) == []
 
@@ -374,7 +376,8 @@ def test_what_was_trained_is_saved_where_a_logger_fails_after_a_step(
     shutil.rmtree(trainer.base_dir)
     with pytest.raises(WriteError, match=r"^/x/events could not be written \(No such file or directory; "):
         trainer.train()
-    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000003.ckpt"]
+    names = [path.name for path in trainer.checkpoint_dir.iterdir()]
+    assert names == ["step-000000003.ckpt"]
 
 
 @pytest.mark.hard_case("the disk is full while a PLY is exported", "`WriteError`; the previous file is as it was")
@@ -389,7 +392,8 @@ def test_a_full_disk_leaves_the_previous_export(tmp_path: Path):
     fill_disk(tmp_path / ".splat.partial.ply")
     with pytest.raises(WriteError, match=r"splat\.ply could not be written \(.+ GB free there\): make room or "):
         write(10_000)
-    assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["splat.ply"]
     assert (tmp_path / "splat.ply").read_bytes() == before
 
 
@@ -505,7 +509,8 @@ def test_a_file_of_the_user_s_among_checkpoints_is_passed_over_and_kept(name: st
         shutil.copy(saved, tmp_path / path)
     assert checkpoints.checkpoint_paths(tmp_path, None, None) == [tmp_path / saved.name]
     checkpoints.write(tmp_path, 9, {}, keep=False)
-    assert {path.name for path in tmp_path.iterdir()} == {"step-000000009.ckpt", name}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"step-000000009.ckpt", name}
 
 
 @pytest.mark.hard_case("no checkpoint in the folder, none of that step", "refused: the steps there are")

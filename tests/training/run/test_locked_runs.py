@@ -65,7 +65,8 @@ def test_a_second_run_in_one_folder_is_refused_at_its_start(config: SadgsTrainer
         )
         assert list(folder.iterdir()) == []
     config.save_config()
-    assert [path.name for path in folder.iterdir()] == ["config.yml"]
+    names = [path.name for path in folder.iterdir()]
+    assert names == ["config.yml"]
 
 
 def test_the_folder_is_locked_until_training_ends(config: SadgsTrainerConfig):
@@ -93,7 +94,8 @@ def test_a_file_that_another_process_writes_is_refused_and_left_alone(tmp_path: 
     assert partial.read_text() == "half"
     with atomic_path(tmp_path / "splat.ply") as path:
         path.write_text("whole")
-    assert [path.name for path in tmp_path.iterdir()] == ["splat.ply"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["splat.ply"]
 
 
 @pytest.mark.hard_case("a file system without locks, as some network file systems", "a line, and the work is done")

@@ -206,16 +206,16 @@ def test_a_camera_path_that_cannot_be_drawn_is_one_sentence(
 def test_opacity_and_the_colour_of_a_crop_are_drawn(run: tuple[int, Path], tmp_path: Path):
     path_command(run[1], tmp_path, json.dumps(PATH), rendered_output_names=["rgba"]).main()
     path_command(run[1], tmp_path / "views", json.dumps(PATH)).main()
-    with Image.open(tmp_path / "views" / "00000.png") as image:
+    with Image.open(tmp_path / "views/00000.png") as image:
         rgba = np.asarray(image) / 255
-    with Image.open(tmp_path / "views" / "views" / "00000.png") as image:
+    with Image.open(tmp_path / "views/views/00000.png") as image:
         rgb = np.asarray(image) / 255
     alpha = rgba[..., 3:]
     assert rgba.shape == (36, 48, 4)
     assert alpha.min() < 1 < 48 * 36 * alpha.mean()
     assert np.abs(alpha * rgba[..., :3] - rgb).max() < 0.02  # The model's background is black.
     path_command(run[1], tmp_path, json.dumps(PATH | {"crop": CROP})).main()
-    with Image.open(tmp_path / "views" / "00000.png") as image:
+    with Image.open(tmp_path / "views/00000.png") as image:
         assert (np.asarray(image) >= [254, 0, 0]).all()
         assert (np.asarray(image)[..., 1:] <= 1).mean() > 0.9
     for options in ({"image_format": "jpeg"}, {"rendered_output_names": ["rgb", "rgba"]}):

@@ -215,7 +215,7 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     command += ["--max-num-iterations", str(iterations), "--steps-per-save", "5", "--vis", "tensorboard"]
     command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]
     command += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
-    folder = tmp_path / "a run" / "sadgs" / "first" / "nerfstudio_models"
+    folder = tmp_path / "a run/sadgs/first/nerfstudio_models"
     files = tmp_path / "output", tmp_path / "errors"
     program = forked_python.NS_TRAIN.format(command)  # It does not matter where pip has put the script ns-train.
     process = forked_python.start(forked_python.into_files, files, program, dict(os.environ))
@@ -239,7 +239,8 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     assert words == ["ns-train", "sadgs", "--load-config", str(folder.with_name("config.yml"))]
     resume(tyro.cli(AnnotatedBaseConfigUnion, args=words[1:]))  # in this process, which has imported everything
     assert f"Resuming after step {done - 1} of {path}" in capsys.readouterr().out
-    assert [p.name for p in folder.iterdir()] == [f"step-{iterations - 1:09d}.ckpt"]
+    names = [p.name for p in folder.iterdir()]
+    assert names == [f"step-{iterations - 1:09d}.ckpt"]
 
 
 @pytest.fixture
