@@ -103,13 +103,14 @@ def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_dist
 
 
 @pytest.mark.hard_case(
-    "ten kills in 300 iterations (slow): two in each of those places, one after a step and one from outside at "
+    "ten kills in 90 iterations (slow): two in each of those places, one after a step and one from outside at "
     "a random time",
     "the same; nothing is left over",
 )
 @pytest.mark.slow
 def test_a_run_killed_ten_times_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
-    printed = kill_and_resume(tmp_path, "--kills", 10)
+    sizes = ("--kills", 10, "--iterations", 90, "--save-every", 6, "--width", 48, "--views", 10)
+    printed = kill_and_resume(tmp_path, *sizes)
     assert printed.count("exit -9") == 10
     assert "bitwise equal; left over: []" in printed
 
