@@ -78,7 +78,8 @@ def test_signatures(function: Callable[..., Any]):
     leading, defaults = EXPECTED[function]
     parameters = inspect.signature(function).parameters
     assert " ".join(parameters).startswith(leading)
-    assert {name: parameters[name].default for name in defaults} == defaults
+    actual = {name: parameters[name].default for name in defaults}
+    assert actual == defaults
     required = [name for name, parameter in parameters.items() if parameter.default is inspect.Parameter.empty]
     assert leading.startswith(" ".join(required)), "a parameter without a default is new"
 

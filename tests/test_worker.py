@@ -104,7 +104,8 @@ def test_a_worker_has_imported_before_its_arguments_come(program, tmp_path: Path
     assert log.read_text("utf8") == "imported\n$ x 'y z'\nran with a b x y z\n"
     with Worker("program:function", log):
         pass
-    assert log.read_text("utf8").count("ran with") == 1
+    actual = log.read_text("utf8").count("ran with")
+    assert actual == 1
 
 
 def test_a_worker_ends_when_its_threads_and_what_is_due_at_its_exit_are_done(program):

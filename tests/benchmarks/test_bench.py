@@ -49,7 +49,8 @@ def result(**changes: Any) -> dict[str, Any]:
 def test_jobs_are_rows_then_scenes_then_seeds():
     rows = [row(label="a"), row(label="b", scenes=["south"], seeds=[7])]
     jobs = protocol.parse(content(rows=rows, seeds=[0, 1])).jobs()
-    assert [(j.row.label, j.scene.name, j.seed) for j in jobs] == [
+    actual = [(j.row.label, j.scene.name, j.seed) for j in jobs]
+    assert actual == [
         ("a", "fox", 0), ("a", "fox", 1), ("a", "south", 0), ("a", "south", 1), ("b", "south", 7),
     ]  # fmt: skip
 
@@ -301,7 +302,8 @@ def test_gpus_are_shared_out(tmp_path: Path):
     runner = FakeRunner()
     seen = []
     bench.run_all(some_jobs("abcd"), runner, seen.append, tmp_path / "log", gpus=["0", "1"], jobs_per_gpu=2)
-    assert [gpu for _, gpu in runner.started] == ["0", "1", "0", "1"]
+    actual = [gpu for _, gpu in runner.started]
+    assert actual == ["0", "1", "0", "1"]
     for r in seen:
         assert r["jobs_per_gpu"] == 2
 
@@ -376,7 +378,8 @@ def test_runs_on_other_numbers_of_devices_are_not_mixed(
 
 def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "results.jsonl"
-    assert results.read(path, missing_ok=True) == []
+    actual = results.read(path, missing_ok=True)
+    assert actual == []
     results.append(path, result(key="a"))
     with path.open("a") as file:
         file.write('{"key": "b", "sta')
@@ -444,7 +447,8 @@ def test_a_finished_run_is_one_line():
         "fox ours seed 0: loop 10.0 s, PSNR 30.00, SSIM 0.9000, LPIPS 0.1000, 1,000 Gaussians, 2.00 GB"
     )
     assert bench.line(result(lpips=None, peak_gb=None)).endswith("SSIM 0.9000, 1,000 Gaussians")
-    assert bench.line(result(status="failed", error="no data.")) == "fox ours seed 0: failed: no data."
+    actual = bench.line(result(status="failed", error="no data."))
+    assert actual == "fox ours seed 0: failed: no data."
 
 
 def test_other_commands_are_told_and_reached(capsys: pytest.CaptureFixture[str]):

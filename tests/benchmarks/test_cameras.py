@@ -109,7 +109,8 @@ def test_a_tenth_of_the_observations_is_left_out_and_three_of_each_point_stay():
     assert true.compute_num_observations() == before - count
     assert true.num_points3D() == points
     assert min(point.track.length() for point in true.points3D.values()) == 3
-    assert_allclose(reprojection_errors(true, left_out), 0.0, atol=1e-6)
+    actual = reprojection_errors(true, left_out)
+    assert_allclose(actual, 0.0, atol=1e-6)
 
 
 def test_points_of_two_or_three_observations_keep_them():
@@ -272,7 +273,8 @@ def test_the_table_has_a_line_for_each_variant(rows: list[dict[str, Any]]):
     assert len(captures) == 4
     assert captures[2].startswith(f"| room | today's | released | {VIEWS} of {VIEWS} | ")
     assert captures[2].endswith(f" | {rows[0]['cores']} | 2 |")
-    assert camera_table.markdown(rows, {"old": "as of then"}) == ""
+    actual = camera_table.markdown(rows, {"old": "as of then"})
+    assert actual == ""
 
 
 def test_tables_show_means_and_the_worst_of_all_pairs_and_no_seconds_of_a_busy_machine():

@@ -203,7 +203,8 @@ def test_each_command_that_repeats_a_capture_runs_it_alone():
         jobs = [
             job for job in protocol.load(path).jobs() if re.search(only, f"{job.scene.name}/{job.row.label}/{job.seed}")
         ]
-        assert {job.scene.name for job in jobs} == {name}
+        actual = {job.scene.name for job in jobs}
+        assert actual == {name}
         assert "sadgs" in {job.row.method for job in jobs}
     for name, capture in photos.items():
         words = shlex.split(capture.repeat.replace("NAME", name))

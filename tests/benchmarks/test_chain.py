@@ -36,10 +36,12 @@ def test_every_eighth_photo_is_held_out_whatever_its_suffix_in_the_scene(tmp_pat
     # The seventeenth did not register, and the ninth was converted.
     names = [f"images/{name}" for name in photos[:16] if name != "08.jpg"] + ["images/08.jpg.png"]
     write_json(tmp_path / "transforms.json", {"frames": [{"file_path": name} for name in names]})
-    assert chain.hold_out(tmp_path, chain.held_out(photos)) == 14
+    actual = chain.hold_out(tmp_path, chain.held_out(photos))
+    assert actual == 14
     described = read_json(tmp_path / "transforms.json")
     assert set(described["test_filenames"]) == {"images/00.jpg", "images/08.jpg.png"} == set(described["val_filenames"])
-    assert set(described["train_filenames"]) == set(names) - set(described["test_filenames"])
+    actual = set(described["train_filenames"])
+    assert actual == set(names) - set(described["test_filenames"])
 
 
 def row(label: str, seed: int, views: dict[str, list[float]], **fields: Any) -> dict[str, Any]:
@@ -166,7 +168,8 @@ def test_the_score_falls_when_the_photos_are_blurred_before_training(tmp_path: P
         train(scene, images, file)
         splat = chain_score.read_splat(file, torch.device("cpu"))
         scores[name] = chain_score.compare(folder, photos, splat, 1600, names)
-    assert list(scores["sharp"]["views"]) == chain.held_out(names)
+    actual = list(scores["sharp"]["views"])
+    assert actual == chain.held_out(names)
     assert scores["sharp"]["registered"] == VIEWS
     assert scores["sharp"]["missing"] == []
     assert scores["sharp"]["psnr"] > scores["blurred"]["psnr"] + 0.5

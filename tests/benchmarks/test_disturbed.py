@@ -120,7 +120,8 @@ def test_masks_are_white_exactly_where_a_photo_is_as_it_was(scene: Path, copy: P
     for name, photo in disturbed_photos(copy).items():
         differs = (pixels(scene / "images" / name) != pixels(copy / "disturbed" / name)).any(axis=-1)
         mask = pixels((copy / "true_masks" / name).with_suffix(".png"))
-        assert_array_equal(mask, np.where(differs, 0, 255))
+        expected = np.where(differs, 0, 255)
+        assert_array_equal(mask, expected)
         assert 0.03 <= differs.mean() <= 0.15
         assert photo["share"] == pytest.approx(differs.mean(), abs=1e-4)
         assert 1 <= len(photo["things"]) <= 3
@@ -148,7 +149,8 @@ def test_a_thing_of_the_photo_s_own_colour_still_makes_a_difference(level: int):
     thing = CutOut("plain", np.dstack([np.full((20, 20, 3), level, np.uint8), np.full((20, 20), 255, np.uint8)]))
     result, covered, _ = disturb(photo, [thing], np.random.default_rng(0))
     difference = np.abs(result.astype(int) - photo).sum(axis=-1)
-    assert_array_equal(difference, covered.astype(int))
+    expected = covered.astype(int)
+    assert_array_equal(difference, expected)
 
 
 def test_a_thing_keeps_its_colour_and_fades_at_its_edge_alone():
@@ -282,7 +284,8 @@ def test_rows_of_the_protocol_read_the_photos_and_masks_that_they_name(
         outputs = parser.get_dataparser_outputs(split)
         names = [path.name for path in outputs.image_filenames]
         assert names == names_in_list(copy, split)
-        assert {path.parent.name for path in outputs.image_filenames} == {folder}
+        actual = {path.parent.name for path in outputs.image_filenames}
+        assert actual == {folder}
         masked = {path.name for path in outputs.mask_filenames or [] if path != NO_MASK}
         expected = {Path(name).with_suffix(".png").name for name in disturbed_photos(copy)}
         assert masked == (expected if has_masks and split == "train" else set())

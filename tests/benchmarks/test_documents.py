@@ -75,8 +75,9 @@ def test_runs_are_a_line_each(tmp_path: Path):
     folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
     status = bench.main(["documents", str(folder)])
     assert status == 0
+    actual = (folder / "README.md").read_text("utf8")
     assert (
-        (folder / "README.md").read_text("utf8")
+        actual
         == """# Title
 
 <!-- table: main -->

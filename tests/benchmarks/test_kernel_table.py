@@ -53,7 +53,8 @@ def test_a_twin_stands_in_a_kernel_s_place_only_meanwhile(name: str):
     with replaced(twin):
         stand_ins = [getattr(module, name) for module, name in places]
     assert stand_ins == [patch.stand_in for patch in twin.patches]
-    assert [getattr(module, name) for module, name in places] == before
+    actual = [getattr(module, name) for module, name in places]
+    assert actual == before
     assert not set(before) & set(stand_ins)
 
 
@@ -186,7 +187,8 @@ def test_what_was_timed_leaves_the_run_as_it_was(trainer: Any):
     state.restore()
     Rounds(trainer, twins, measured).run(PHASES[0], rounds=2, limit=100.0)
     trainer.pipeline.model.step = 3
-    assert differences(before, without_random_numbers(state_of(trainer))) == []
+    actual = differences(before, without_random_numbers(state_of(trainer)))
+    assert actual == []
     for of_twin in measured.values():
         assert of_twin.error == ""
         assert len(of_twin.seconds["densification"]) == 2
@@ -259,7 +261,8 @@ def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kern
     part = dataclasses.replace(part, is_short=False)
     assert len(kernel_share.rows_of(part, measured)) == 2
     measured.about["devices"] = 2
-    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
+    actual = [row["label"] for row in kernel_share.rows_of(part, measured)]
+    assert actual == ["poses"]
 
 
 def test_what_images_take_more_is_added_to_the_steps():
@@ -289,7 +292,8 @@ def test_one_device_measures_all_kernels_but_those_that_send_and_two_only_these(
     (part,) = kernel_share.parts_of(JOB, 2, (), with_options=True)
     assert [*part.twins] == [REFERENCE, "exchange"]
     assert part.job.row.overrides == {"share_always": True}
-    assert kernel_share.parts_of(JOB, 2, ("tiles",), with_options=True) == []
+    actual = kernel_share.parts_of(JOB, 2, ("tiles",), with_options=True)
+    assert actual == []
     (part,) = kernel_share.parts_of(JOB, 1, ("tiles",), with_options=True)
     assert [*part.twins] == [REFERENCE, "tiles"]
 

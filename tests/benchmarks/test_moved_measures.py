@@ -63,8 +63,10 @@ def test_all_that_is_found_in_the_scene_s_own_photos_is_wrong(tmp_path: Path):
 
 
 def test_a_run_that_was_not_to_find_anything_has_no_such_fields(tmp_path: Path):
-    assert moved.measures(pipeline_of([tmp_path / "images/0.jpg"], {}, finds=False)) == {}
-    assert moved.measures(SimpleNamespace(config=SimpleNamespace())) == {}
+    actual = moved.measures(pipeline_of([tmp_path / "images/0.jpg"], {}, finds=False))
+    assert actual == {}
+    actual = moved.measures(SimpleNamespace(config=SimpleNamespace()))
+    assert actual == {}
 
 
 def result(label: str, **fields: float) -> Result:
@@ -95,6 +97,8 @@ def test_evidence_of_a_run_is_drawn(scene: Path, tmp_path: Path, capsys: pytest.
     with Image.open(drawn[0]) as picture, Image.open(scene / "images/001.png") as photo:
         assert picture.size == (3 * photo.width, 2 * photo.height)
         corner = picture.convert("RGB").crop((0, 0, photo.width, photo.height))
-        assert_array_equal(np.asarray(corner), np.asarray(photo.convert("RGB")))
+        actual = np.asarray(corner)
+        expected = np.asarray(photo.convert("RGB"))
+        assert_array_equal(actual, expected)
     output = capsys.readouterr().out
     assert "deviation" in output and "001.png: 0.0% found" in output

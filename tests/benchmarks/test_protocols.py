@@ -92,7 +92,8 @@ def test_every_row_of_every_protocol_fits_the_config_of_its_method(name: str, tm
 def test_table_1_has_the_settings_of_the_paper(name: str, tmp_path: Path):
     built = configs(name, tmp_path)
     for ours in ("sadgs", "sadgs-paper"):
-        assert {scene for scene, label in built if label == ours} == set(load(name).scenes)
+        actual = {scene for scene, label in built if label == ours}
+        assert actual == set(load(name).scenes)
     for (scene, label), config in built.items():
         parser = config.pipeline.datamanager.dataparser
         assert parser.eval_mode == "interval"
@@ -259,7 +260,8 @@ def test_names_come_in_the_models_order_from_the_folder_of_that_size(tmp_path: P
 
 def test_without_a_factor_the_folder_is_the_one_that_nerfstudio_would_choose(tmp_path: Path):
     small = colmap_scene(tmp_path / "small", "images", size=(1600, 1))
-    assert names_of({"colmap_path": "sparse/0"}, small) == ["a.jpg", "b.jpg"]
+    actual = names_of({"colmap_path": "sparse/0"}, small)
+    assert actual == ["a.jpg", "b.jpg"]
     large = colmap_scene(tmp_path / "large", "images", size=(3201, 1))
     with pytest.raises(FileNotFoundError, match="large/images_4 does not exist"):
         names_of({"colmap_path": "sparse/0"}, large)

@@ -79,7 +79,8 @@ def test_the_picture_has_a_bar_for_each_part_that_is_not_too_short():
         bars.append((corners.x0, corners.width))
     assert name == "fox-new"
     assert bars == [(1.0, 3.0), (1.5, 1.5)]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["sadgs: cameras", "COLMAP: features"]
+    actual = [label.get_text() for label in axes.get_yticklabels()]
+    assert actual == ["sadgs: cameras", "COLMAP: features"]
 
 
 def test_the_protocol_names_three_captures_of_which_one_is_thinned():

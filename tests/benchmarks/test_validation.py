@@ -97,7 +97,8 @@ def test_a_scene_that_lists_its_views_keeps_its_test_views_out(tmp_path: Path):
         parser = NerfstudioDataParserConfig(data=tmp_path / "out" / copy, downscale_factor=1).setup()
         expected = {"train": [name for name in names[:20] if name not in held_out], "val": held_out, "test": held_out}
         for split, chosen in expected.items():
-            assert [path.name for path in parser.get_dataparser_outputs(split).image_filenames] == chosen
+            actual = [path.name for path in parser.get_dataparser_outputs(split).image_filenames]
+            assert actual == chosen
 
 
 def test_a_folder_without_scenes_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -112,9 +112,11 @@ def test_the_harmonics_are_gsplat_s_and_orthonormal():
     for band in range(16):
         coefficients = torch.eye(16, dtype=torch.float64)[band].repeat(100, 1)[..., None].expand(-1, -1, 3)
         theirs = _spherical_harmonics(3, torch.from_numpy(directions()), coefficients)[:, 0]
-        assert_allclose(basis[:, band], theirs, atol=2e-14)
+        actual = basis[:, band]
+        assert_allclose(actual, theirs, atol=2e-14)
     identity = Similarity(1.0, np.eye(3), np.zeros(3)).harmonics(3)
-    assert_allclose(identity, np.eye(16), atol=1e-14)
+    expected = np.eye(16)
+    assert_allclose(identity, expected, atol=1e-14)
 
 
 @given(seed=st.integers(0, 2**32 - 1), reflection=st.booleans(), degree=st.integers(0, 3))
@@ -284,7 +286,8 @@ def test_a_foreign_reader_finds_every_gaussian(n: int, tmp_path: Path):
     params = gaussians(n)
     transform = np.c_[SWAP, [1.0, 2, 3]]
     run = write_run(tmp_path / "run", params, transform, scale=0.5)
-    assert export.export(Export(run, tmp_path / "splat.ply", "colmap")) == n
+    actual = export.export(Export(run, tmp_path / "splat.ply", "colmap"))
+    assert actual == n
     cloud = trimesh.load(tmp_path / "splat.ply")
     expected = (params["means"].double().numpy() / 0.5 - [1, 2, 3]) @ SWAP
     assert_allclose(cloud.vertices, expected, rtol=1e-6, atol=1e-6)  # type: ignore[union-attr]
@@ -301,7 +304,8 @@ def test_what_is_not_finite_is_dropped_in_every_part_of_the_file(tmp_path: Path,
     params["features_rest"][69_000:, 2, 1] = torch.inf  # the last part is empty, and the count has a digit less
     params["means"][5, 1] = 3e38  # finite, but not in a frame in which the unit is smaller
     run = write_run(tmp_path / "run", params, np.eye(3, 4), scale=0.1)
-    assert export.export(Export(run, tmp_path / "splat.ply", "colmap")) == 68_998
+    actual = export.export(Export(run, tmp_path / "splat.ply", "colmap"))
+    assert actual == 68_998
     printed = capsys.readouterr().out
     assert "dropped 71002 of 140000 Gaussians that are not finite" in printed
     vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
@@ -586,13 +590,15 @@ def test_the_run_is_its_folder_its_config_or_a_checkpoint_and_the_latest_is_take
     torch.save(later, models / "step-000000011.ckpt")
     counts = [export.export(Export(path, tmp_path / "a.ply")) for path in (run, run / "config.yml", models)]
     assert counts == [9, 9, 9]
-    assert export.export(Export(models / "step-000000007.ckpt", tmp_path / "a.ply")) == 3
+    actual = export.export(Export(models / "step-000000007.ckpt", tmp_path / "a.ply"))
+    assert actual == 3
 
 
 def test_a_damaged_latest_checkpoint_is_passed_over_aloud(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run = write_run(tmp_path / "run", gaussians(3))
     (run / "nerfstudio_models/step-000000011.ckpt").write_bytes(b"half")
-    assert export.export(Export(run, tmp_path / "a.ply")) == 3
+    actual = export.export(Export(run, tmp_path / "a.ply"))
+    assert actual == 3
     printed = " ".join(capsys.readouterr().out.split())
     assert "step-000000011.ckpt is cut off, damaged" in printed
     assert "step-000000007.ckpt instead" in printed

@@ -74,7 +74,8 @@ def test_training_on_the_written_cameras_begins_where_the_run_ended(scene: Path,
     outputs = parser.setup().get_dataparser_outputs("train")
     assert_within(outputs.cameras.camera_to_worlds, refined_poses(trainer), 2e-6)
     before = trainer.pipeline.datamanager.train_dataset.cameras
-    assert_close(outputs.cameras.get_intrinsics_matrices(), before.get_intrinsics_matrices())
+    actual = outputs.cameras.get_intrinsics_matrices()
+    assert_close(actual, before.get_intrinsics_matrices())
 
 
 def test_cameras_of_a_run_with_fixed_poses_are_those_of_the_capture(

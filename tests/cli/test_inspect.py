@@ -91,7 +91,8 @@ def test_all_pictures_of_a_finished_run_are_written(run: Path, tmp_path: Path, c
     status = inspect.main([str(run), "--view", "1", "--output", str(tmp_path / "new")])
     assert status == 0
     names = [f"train-001-{name}.png" for name in ("ellipses", "wavelength", "eta", "children", "low", "step")]
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
+    actual = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert actual == sorted(names)
     printed = capsys.readouterr().out
     assert f"after {ITERATIONS} iterations" in printed
     assert f"{TRAIN_VIEWS} training views" in printed
@@ -251,7 +252,8 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before = early.state_dict()["_model.gauss_params.means"].clone()
     random = torch.get_rng_state()
     first = observe_training_views(early.structure_cache)
-    assert_close(observe_training_views(early.structure_cache), first)
+    actual = observe_training_views(early.structure_cache)
+    assert_close(actual, first)
     inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
@@ -279,7 +281,8 @@ def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
     assert float(gradients["absgrad2d"].max()) > float(gradients["grad2d"].max()) > 0
     step = inspection.conventional_step(model, gradients)
     sizes = torch.bincount(step["origins"], minlength=model.num_points)
-    assert set(sizes.unique().tolist()) == {1, 2}
+    actual = set(sizes.unique().tolist())
+    assert actual == {1, 2}
     assert len(step["means"]) == len(step["origins"]) > model.num_points
     assert torch.equal(inspection.conventional_step(model, gradients)["means"], step["means"])
 
@@ -296,7 +299,8 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
         x, y = (pixels[:, :2] / pixels[:, 2:]).floor().long().unbind(-1)
         inside = (pixels[:, 2] > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         errors = [(other.photo[y[inside], x[inside]] - colors[inside]).abs().mean() for other in views]
-        assert int(torch.stack(errors).argmin()) == number
+        actual = int(torch.stack(errors).argmin())
+        assert actual == number
         assert int(inside.sum()) > 30
 
 
@@ -310,7 +314,8 @@ def a_camera(pipeline: SadgsPipeline, index: int = 0) -> Cameras:
 @pytest.mark.filterwarnings("ignore:This property will be removed:DeprecationWarning")  # of torchmetrics, not ours
 def test_the_viewer_finds_the_elements_in_their_order(panel: StructurePanel):
     found = [path for path, _ in parse_object(pipeline_of(panel), ViewerElement, "Custom Elements")]
-    assert [path.removeprefix("Custom Elements/structure/") for path in found if "/structure/" in path] == [
+    actual = [path.removeprefix("Custom Elements/structure/") for path in found if "/structure/" in path]
+    assert actual == [
         "choice", "legend", "observe", "set_max_gaussians", "set_tau_split", "table",
     ]  # fmt: skip
 
@@ -481,7 +486,8 @@ def test_values_out_of_range_are_refused_and_put_back(name: str, values: list[An
 
 def test_counts_of_the_structure_steps_are_kept_in_checkpoints_and_told(run: Path, panel: StructurePanel):
     steps: list[dict[str, int]] = pipeline_of(panel).model.strategy_state["structure_steps"]  # type: ignore[assignment]
-    assert [step["iteration"] for step in steps] == [10, 20, 30]
+    actual = [step["iteration"] for step in steps]
+    assert actual == [10, 20, 30]
     for step in steps:
         assert step["split"] <= step["violating"] <= step["before"]
         assert step["low"] <= step["before"]
@@ -515,8 +521,10 @@ def test_the_nearest_view_is_near_and_looks_the_same_way():
     far[:, 3] = 5.0
     near = here.clone()
     near[0, 3] = 0.3
-    assert nearest_view(torch.stack([behind, far, near]), here, extent=1.0) == 2
-    assert nearest_view(torch.stack([behind, far]), here, extent=100.0) == 1
+    actual = nearest_view(torch.stack([behind, far, near]), here, extent=1.0)
+    assert actual == 2
+    actual = nearest_view(torch.stack([behind, far]), here, extent=100.0)
+    assert actual == 1
 
 
 def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel: StructurePanel):

@@ -29,7 +29,8 @@ NUMBER = r"\d+\.\d+"
 def test_the_sentences_have_means_and_the_worst_view_of_the_file():
     of_run = [{"psnr": 30.0, "ssim": 0.9, "lpips": 0.1}, {"psnr": 20.0, "ssim": 0.8, "lpips": 0.2}]
     of_file = [{"psnr": 18.0, "ssim": 0.7, "lpips": 0.3}, {"psnr": 20.0, "ssim": 0.8, "lpips": 0.4}]
-    assert describe(["a.jpg", "b.jpg"], of_run, of_file, "splat.ply") == [
+    actual = describe(["a.jpg", "b.jpg"], of_run, of_file, "splat.ply")
+    assert actual == [
         "run: PSNR 25.00, SSIM 0.8500, LPIPS 0.1500",
         "splat.ply: PSNR 19.00, SSIM 0.7500, LPIPS 0.3500",
         "2 views were held out; worst in splat.ply is a.jpg, PSNR 18.00",
@@ -38,7 +39,8 @@ def test_the_sentences_have_means_and_the_worst_view_of_the_file():
 
 def test_a_sentence_tells_that_lpips_is_missing():
     measures = [{"psnr": 30.0, "ssim": 0.9}]
-    assert describe(["a.jpg"], measures, measures, "splat.ply") == [
+    actual = describe(["a.jpg"], measures, measures, "splat.ply")
+    assert actual == [
         "run: PSNR 30.00, SSIM 0.9000",
         "splat.ply: PSNR 30.00, SSIM 0.9000",
         "LPIPS is left out, because its AlexNet weights could not be loaded",

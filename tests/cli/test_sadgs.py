@@ -609,7 +609,8 @@ def test_settings_that_an_earlier_version_wrote_are_read(
     lines = lines_of(capsys.readouterr().out)
     assert lines["cameras"] == "4 of 10 photos registered; done before"
     assert lines["training"] == "8 iterations, 3 Gaussians; done before"
-    assert [words[0] for words in commands] == ["sadgs-export"]
+    actual = [words[0] for words in commands]
+    assert actual == ["sadgs-export"]
     assert checkpoint.exists()
     assert read_json(out / "settings.json").items() >= settings.items(), "that version reads it, too"
     commands.clear()
@@ -707,7 +708,8 @@ def test_a_run_is_not_that_of_cameras_that_were_found_after_it(
     shutil.rmtree(tmp_path / "out/scene")
     commands.clear()
     assert main(command) == 0
-    assert [words[0] for words in commands] == ["sadgs-process", "ns-train", "sadgs-export"]
+    actual = [words[0] for words in commands]
+    assert actual == ["sadgs-process", "ns-train", "sadgs-export"]
     printed = capsys.readouterr().out
     assert "done before" not in printed
     assert "--load-dir" not in commands[1]
@@ -728,7 +730,8 @@ def test_the_process_that_exports_starts_while_training_runs(
     status = main([str(scene), "-o", str(tmp_path / "out"), "--formats", "html,ply"])
     assert status == 0
     assert started == [("training", []), ("export", ["ns-train"])], "one process makes both files"
-    assert [words[0] for words in commands] == ["ns-train", "sadgs-export", "sadgs-export"]
+    actual = [words[0] for words in commands]
+    assert actual == ["ns-train", "sadgs-export", "sadgs-export"]
 
 
 @pytest.fixture(params=LAYOUTS)

@@ -117,8 +117,10 @@ def test_the_parser_is_chosen_by_what_the_folder_holds(layout: str, scene: Path,
     lay_out, expected = LAYOUTS[layout]
     lay_out(scene, data)
     config = SadgsDatamanagerConfig(data=data)
-    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
-    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert actual == []
+    actual = [finding for finding in check_capture(config) if finding.severity != "note"]
+    assert actual == []
     assert config.dataparser == expected(data)
     if isinstance(config.dataparser, ColmapDataParserConfig):
         parsed = config.dataparser.setup().get_dataparser_outputs()
@@ -160,7 +162,8 @@ def test_the_options_that_a_named_parser_lacks_are_told(layout: str, scene: Path
         check_capture(SadgsDatamanagerConfig(dataparser=ColmapDataParserConfig(data=data)))
     config = parsed("colmap", *shlex.split(str(refused.value).split("`")[1]))
     config.data = data
-    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    actual = [finding for finding in check_capture(config) if finding.severity != "note"]
+    assert actual == []
     expected_parser = expected(data)
     assert isinstance(config.dataparser, ColmapDataParserConfig)
     assert isinstance(expected_parser, ColmapDataParserConfig)
@@ -176,7 +179,8 @@ def test_another_model_of_as_many_images_is_told(scene: Path, tmp_path: Path):
     colmap_in("sparse/0")(scene, tmp_path)
     for file in (tmp_path / "sparse/0").iterdir():
         shutil.copy(file, tmp_path / "sparse")
-    assert [finding for finding in check_data(tmp_path) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(tmp_path) if finding.severity != "note"]
+    assert actual == []
     model = pycolmap.Reconstruction(tmp_path / "sparse")
     model.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), [5.0, 0.0, 0.0]))
     model.write(tmp_path / "sparse")
@@ -202,7 +206,8 @@ def test_a_larger_model_is_told(scene: Path, tmp_path: Path):
     ) in sentences
     config = parsed("colmap", "--colmap-path", "sparse/1")
     config.data = tmp_path
-    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    actual = [finding for finding in check_capture(config) if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.hard_case(
@@ -406,7 +411,8 @@ def test_smaller_copies_without_the_images_are_read_by_the_option_that_is_told(
     words = ["colmap", "--colmap-path", "sparse/0"] if layout == "colmap" else ["nerfstudio-data"]
     config = parsed(*words, "--downscale-factor", "4")
     config.data = config.dataparser.data = data
-    assert [finding for finding in check_capture(config) if finding.severity != "note"] == []
+    actual = [finding for finding in check_capture(config) if finding.severity != "note"]
+    assert actual == []
     names = config.dataparser.setup().get_dataparser_outputs().image_filenames
     for name in names:
         assert name.is_file()
@@ -477,7 +483,8 @@ def test_images_that_are_to_be_divided_by_their_names_need_such_names(tmp_path: 
         image.rename(image.with_stem(name))
         path.write_text(path.read_text().replace(f"images/{image.stem}.", f"images/{name}."))
     findings = check_capture(SadgsDatamanagerConfig(dataparser=parser))
-    assert [finding for finding in findings if finding.severity != "note"] == []
+    actual = [finding for finding in findings if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.hard_case(
@@ -509,4 +516,5 @@ def test_lists_without_test_images_and_with_training_images_among_them_are_warne
     )
     content["test_filenames"] = names[:2]
     write_json(path, content)
-    assert [finding for finding in check_data(tmp_path) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(tmp_path) if finding.severity != "note"]
+    assert actual == []

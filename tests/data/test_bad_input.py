@@ -959,7 +959,8 @@ def test_bad_data_are_refused_in_one_sentence_by_training_and_doctor_alike(
 
 @pytest.mark.parametrize("layout", ["colmap", "nerfstudio", "blender"])
 def test_good_data_have_no_error_and_no_warning(layout: str, captures: Path):
-    assert [finding for finding in check_data(captures / layout) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(captures / layout) if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.hard_case("views from a tripod, in one place but for rounding, and one beside it", "no warning")
@@ -973,7 +974,8 @@ def test_views_from_a_tripod_are_as_good_as_others(copied: Callable[[str], Path]
 
     meta(move)(data)
     with_points([[0.5, 0.5, 0.5 + 0.01 * i] for i in range(4)])(data)
-    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert actual == []
 
 
 def test_a_run_checks_its_data_once_and_other_ways_to_a_pipeline_check_them_too(
@@ -1016,7 +1018,8 @@ def test_an_orientation_that_a_size_tells_of_is_no_warning(copied: Callable[[str
     for side, told in ((HEIGHT, 1), (HEIGHT - 2, 0)):
         store_turned((side, HEIGHT), 8)(data)
         meta(lambda m, side=side: [frame.update(w=side, cx=side / 2) for frame in [*m["frames"], m]])(data)
-        assert sum("EXIF orientation" in finding.sentence for finding in remarks(data)) == told
+        actual = sum("EXIF orientation" in finding.sentence for finding in remarks(data))
+        assert actual == told
 
 
 @pytest.mark.hard_case("masks that hide nothing in any image", "a warning")
@@ -1031,7 +1034,8 @@ def test_masks_that_hide_nothing_are_told(color: int, copied: Callable[[str], Pa
     with Image.open(data / "mask.png") as image:
         image.putpixel((3, 3), 0)
         image.save(data / "mask.png")
-    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.hard_case("several bad images", "one sentence for each kind: the first, and how many more")
@@ -1141,7 +1145,8 @@ def test_a_lens_of_a_telescope_is_a_warning(copied: Callable[[str], Path]):
 def test_points_behind_some_cameras_are_a_warning(copied: Callable[[str], Path]):
     data = copied("nerfstudio")
     with_points([[0.5, 0.5, 0.5 + 0.01 * i] for i in range(4)])(data)
-    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert actual == []
     change_poses(*range(6), times=np.diag([1.0, -1, -1, 1]))(data)  # OpenCV's axes instead of OpenGL's
     (finding,) = [finding for finding in check_data(data) if finding.severity != "note"]
     assert finding.severity == "warning"
@@ -1191,7 +1196,8 @@ def test_points_beside_a_blender_scene_are_checked(copied: Callable[[str], Path]
         findings = check_blender(data, ParserOptions(ply_path=Path("p.ply")))
         return [finding.sentence for finding in findings if finding.severity == "error"]
 
-    assert check([0.5, 0.5, 0.5], [1, 1, 1]) == []
+    actual = check([0.5, 0.5, 0.5], [1, 1, 1])
+    assert actual == []
     (sentence,) = check([50, 50, 20], [51, 50, 20])
     assert re.fullmatch(r"\S+/p\.ply has points that no camera can see in front of it: .*\.", sentence)
     (sentence,) = check()
@@ -1336,7 +1342,8 @@ def test_images_and_masks_of_several_kinds_and_few_points_train(copied: Callable
         image.save(data / "mask3.png")  # of a single pixel
     meta(lambda m: [frame.update(mask_path=f"mask{k % 5}.png") for k, frame in enumerate(m["frames"])])(data)
     with_points([[0, 0, 0.01 * i] for i in range(4)])(data)
-    assert [finding for finding in check_data(data) if finding.severity != "note"] == []
+    actual = [finding for finding in check_data(data) if finding.severity != "note"]
+    assert actual == []
     config = configure(tmp_path / "out", parser_of(data), iterations=8)
     config.pipeline.views_per_iteration = 2
     assert is_finite(train(config).pipeline.model)
@@ -1428,7 +1435,8 @@ def test_an_images_txt_in_another_encoding_is_refused(tmp_path: Path):
 
 def test_colmap_s_camera_models_are_those_that_nerfstudio_knows():
     theirs = {i: (m.model_name, m.num_params) for i, m in colmap_parsing_utils.CAMERA_MODEL_IDS.items()}
-    assert dict(enumerate(colmap.CAMERA_PARAMETERS.items())) == theirs
+    actual = dict(enumerate(colmap.CAMERA_PARAMETERS.items()))
+    assert actual == theirs
 
 
 def test_colmap_s_text_and_binary_models_read_alike_and_as_nerfstudio_reads_them(
@@ -1473,7 +1481,8 @@ def test_scaled_down_images_are_compared_with_scaled_down_cameras(
     for path in (data / "images").iterdir():
         Image.effect_noise((47 // factor, 35 // factor), 50).save(data / f"images_{factor}" / path.name)
     findings = check_nerfstudio(data, ParserOptions(downscale_factor=factor))
-    assert [finding for finding in findings if finding.severity == "error"] == []
+    actual = [finding for finding in findings if finding.severity == "error"]
+    assert actual == []
     parser = NerfstudioDataParserConfig(data=data, load_3D_points=True, downscale_factor=factor)
     train(configure(tmp_path / "out", parser, iterations=1))  # nerfstudio agrees
     (sentence,) = errors(data)
@@ -1508,7 +1517,8 @@ def test_of_two_hundred_photographs_one_is_decoded(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(ImageFile.ImageFile, "load", note)
     findings = check_data(data)
-    assert [finding for finding in findings if finding.severity != "note"] == []
+    actual = [finding for finding in findings if finding.severity != "note"]
+    assert actual == []
     assert len(decoded) == 1  # to see whether it shows something
 
 

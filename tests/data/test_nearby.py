@@ -189,6 +189,8 @@ def test_files_of_others_and_of_another_kind_are_not_meant(tmp_path: Path):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
     missing = tmp_path / "images/b/0.png"
-    assert NearbyFiles(tmp_path).find(missing) == [tmp_path / "images/a/0.png"]
+    actual = NearbyFiles(tmp_path).find(missing)
+    assert actual == [tmp_path / "images/a/0.png"]
     assert NearbyFiles(tmp_path, [tmp_path / "images/a/0.png"]).sentence(missing) is None
-    assert NearbyFiles(tmp_path).find(tmp_path / "masks/b/0.JPG") == [tmp_path / "masks/0.png"]
+    actual = NearbyFiles(tmp_path).find(tmp_path / "masks/b/0.JPG")
+    assert actual == [tmp_path / "masks/0.png"]

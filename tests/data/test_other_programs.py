@@ -193,7 +193,8 @@ def test_a_scene_that_moves_is_told(kind: str, file: str, write: Callable[..., P
     assert warning.startswith(f"{data}/{file} gives each frame a time, as of a scene that moves, and ")
     shutil.rmtree(data)
     data = write(of_frame=lambda frame: frame.update(time=0.5), kind=kind)
-    assert [finding for finding in check_data(data) if finding.severity == "warning"] == []
+    actual = [finding for finding in check_data(data) if finding.severity == "warning"]
+    assert actual == []
 
 
 @pytest.mark.hard_case(
@@ -234,7 +235,8 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
     cameras = parsed(data)
     expected = torch.full_like(cameras.fx, FOCAL)
     assert_close(cameras.fx, expected)
-    assert set(cameras.cx.flatten().tolist()) == {20.0}
+    actual = set(cameras.cx.flatten().tolist())
+    assert actual == {20.0}
     assert (cameras.distortion_params[:, 0] > 0).all()
 
 

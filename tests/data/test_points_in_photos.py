@@ -135,7 +135,8 @@ def test_damaged_photos_are_told_of_alone(capture: Callable[..., Path]):
 def test_photos_stay_closed_where_they_need_not_exist(capture: Callable[..., Path]):
     options = ParserOptions(colmap_path=SPARSE_FOLDER)
     findings = check_colmap(capture(change=swap), options, open_images=False)
-    assert [finding for finding in findings if finding.severity != "note"] == []
+    actual = [finding for finding in findings if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.parametrize("layout", ["transforms"], indirect=True)

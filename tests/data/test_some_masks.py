@@ -83,7 +83,8 @@ def test_nothing_is_hidden_in_images_without_mask(layout: str, scene: Path, tmp_
         mask = manager.train_dataset.get_data(index)["mask"]
         expected = manager.train_dataset.get_data(index)["image"].shape[:2]
         assert mask.shape[:2] == expected
-        assert int((~mask.bool()).sum()) == number
+        actual = int((~mask.bool()).sum())
+        assert actual == number
 
 
 def test_the_options_that_the_doctor_advises_are_taken(scene: Path, tmp_path: Path):

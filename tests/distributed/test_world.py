@@ -53,7 +53,8 @@ def test_a_world_of_one_process_asks_nobody():
     assert world.take_even_part(5) == slice(0, 5)
     assert world.total == 5
     assert world.sum(values) is values
-    assert world.sums(3, 4) == [3, 4]
+    actual = world.sums(3, 4)
+    assert actual == [3, 4]
     assert world.gather(values).tolist() == [[3, 4]]
     assert values.data_ptr() == world.gather(values).data_ptr()
     world.broadcast(values, 0)

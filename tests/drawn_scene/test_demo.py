@@ -172,7 +172,8 @@ def test_checker_wavelength_is_its_fundamental() -> None:
     assert_allclose(actual, 0.4 * 100.0 / 2.0, rtol=1e-5)
     row = render([checker], camera(), 1)[0, :, 0]
     changes = np.flatnonzero(np.diff(row.astype(int)))
-    assert_allclose(np.diff(changes).mean(), 20.0 / np.sqrt(2.0), atol=1.0)  # a square's side
+    expected = 20.0 / np.sqrt(2.0)
+    assert_allclose(np.diff(changes).mean(), expected, atol=1.0)  # a square's side
 
 
 def test_wavelength_is_foreshortened_along_the_grating_only() -> None:

@@ -234,7 +234,8 @@ def test_an_spz_says_that_its_axes_are_those_of_a_ply(tmp_path: Path):
     assert content[14] == 2, "the flag of records at the end"
     expected = 16 + 4 * (9 + 1 + 3 + 3 + 4 + 45) + 12
     assert len(content) == expected
-    assert struct.unpack("<III", content[-12:]) == (0xADBE0003, 4, 6)  # SPZ_ADOBE_coordinate_system, 4 bytes, RDF
+    actual = struct.unpack("<III", content[-12:])
+    assert actual == (0xADBE0003, 4, 6)  # SPZ_ADOBE_coordinate_system, 4 bytes, RDF
     assert errors(written, read(tmp_path / "splat.spz"))["means"] <= 2.0**-20
 
 

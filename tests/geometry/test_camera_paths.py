@@ -60,7 +60,8 @@ def test_what_floats_on_the_cameras_paths_is_haze_and_nothing_else_is():
     floating = [(x, y, z) for x in (-0.5, 3.0, 10.5) for y in (0.0, 1.5) for z in (-2.0, 0.1, 2.0)]
     assert all(haze(paths, *floating))
     assert not any(haze(paths, *floating[3:6], scale=0.1)), "they look small from each camera and each place between"
-    assert haze(paths, (3.0, 0.0, 0.5), scale=0.1) == [True]
+    actual = haze(paths, (3.0, 0.0, 0.5), scale=0.1)
+    assert actual == [True]
     others = [(3.0, 0.0, 3.1), (3.0, 3.1, 0.0), (-3.1, 0.0, 0.0), (3.0, 0.0, 8.0), (3.0, 0.0, 300.0)]
     assert not any(haze(paths, *others, (float("nan"), 0.0, 0.0), (float("inf"), 0.0, 0.0)))
 
@@ -199,4 +200,5 @@ def test_densification_steps_prune_haze_and_the_last_one_keeps_the_paths_for_a_r
     params["means"].data[0] = means[0]  # Haze that arises later
     strategy.for_run(3000).prune_haze(params, optimizers, state)
     assert params["means"].tolist() == means[2:].tolist()
-    assert {len(p) for p in params.values()} == {1}
+    actual = {len(p) for p in params.values()}
+    assert actual == {1}

@@ -67,7 +67,8 @@ def test_a_photo_with_few_points_has_a_gain_of_1_and_does_not_move_the_others():
     assert found.known.tolist() == others.tolist()
     assert not found.stops[3].any()
     expected = gains[others] - np.median(gains[others], axis=0)
-    assert_allclose(found.stops[others], expected, atol=0.05)
+    actual = found.stops[others]
+    assert_allclose(actual, expected, atol=0.05)
 
 
 def test_photos_with_one_exposure_have_no_spread_beyond_noise():

@@ -40,7 +40,8 @@ def test_the_mean_light_of_9_pixels_is_read_where_the_point_lies():
     values = image[1:4, 5:8].double() / 255
     light = (((values + OFFSET) / (1 + OFFSET)) ** EXPONENT).mean(dim=(0, 1))
     assert indices.tolist() == [0]
-    assert_close(stops, light.log2()[None])
+    expected = light.log2()[None]
+    assert_close(stops, expected)
     _, same = observe_points(image / 255, None, FACING, K, point_at(6.2, 2.9), visible=True)
     assert_within(same, stops, 1e-6)
 
@@ -48,7 +49,8 @@ def test_the_mean_light_of_9_pixels_is_read_where_the_point_lies():
 def test_points_behind_the_camera_at_the_border_or_outside_are_left_out():
     places = [point_at(4.5, 4.5), point_at(4.5, 4.5, -1.0), point_at(0.5, 4.5), point_at(8.5, 4.5), point_at(20, 4)]
     places.append(torch.full((1, 3), torch.nan))
-    assert seen(picture(), torch.cat(places)) == [0]
+    actual = seen(picture(), torch.cat(places))
+    assert actual == [0]
 
 
 @pytest.mark.hard_case("clipped, dark, masked or transparent pixels around a point", "do not tell exposure")

@@ -103,7 +103,8 @@ def test_views_may_differ_in_size_and_be_loaded_one_by_one():
     sizes = [(WIDTH, HEIGHT) if v % 2 else (HEIGHT, WIDTH) for v in range(5)]
     images, viewmats, Ks, points = capture(sizes=sizes)
     maps = depth_maps(images.__getitem__, viewmats, Ks, points, device="cpu")
-    assert [tuple(depth_map.depth.shape[::-1]) for depth_map in maps] == sizes
+    actual = [tuple(depth_map.depth.shape[::-1]) for depth_map in maps]
+    assert actual == sizes
     check(maps, "slanted", viewmats)
 
 

@@ -574,7 +574,8 @@ def test_a_gradient_that_is_not_finite_is_noted_and_left_out_of_its_parameter_al
         gradients = tuple(torch.full_like(p, 0.5) for p in parameters[0])
         gradients[k].flatten()[-1:] = value  # within the block that is not full
         adam.adam_step(parameters[0], gradients, *parameters[1:], factors([1] * 5, LRS), noted, **OURS)
-        assert bool(noted.isnan()) == (value != 0.0)
+        actual = bool(noted.isnan())
+        assert actual == (value != 0.0)
         results.append([tensor for tensors in parameters for tensor in tensors])
     assert all(map(torch.equal, *results))
 
@@ -749,7 +750,8 @@ def test_lists_longer_than_needed_equal_the_exact_ones_tile_by_tile(
         assert starts.shape == (num_views, rows + 1, columns)
         assert len(ids) == capacity
         assert starts.dtype == ids.dtype == torch.int32
-        assert listed_by_tile((starts, ids), rows) == listed_by_tile(exact, rows)
+        actual = listed_by_tile((starts, ids), rows)
+        assert actual == listed_by_tile(exact, rows)
         assert starts.flatten()[-1] == num_pairs, "padding is valid and at the end"
         assert (ids[num_pairs:] == 0).all(), "padding is valid and at the end"
     assert torch.equal(on_device["radii"].cpu(), gaussians["radii"])

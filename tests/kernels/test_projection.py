@@ -139,7 +139,8 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are():
     for name, value in results[1].items():
         assert not value[:50].any()
         assert value[50:].any()
-        assert_close(value, results[0][name])
+        expected = results[0][name]
+        assert_close(value, expected)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

@@ -427,7 +427,8 @@ def test_tile_lists_of_extreme_and_broken_gaussians_miss_none_and_invent_none():
     on_device = {name: value.to(DEVICE) for name, value in gaussians.items()}
     with np.errstate(invalid="ignore"):  # inf − inf, of the broken conics
         starts, ids, _ = tiles.intersect_tiles(**on_device, width=WIDTH, height=HEIGHT, tile_size=size).lists()
-    assert int(starts[0, 0, 0]) == 0
+    actual = int(starts[0, 0, 0])
+    assert actual == 0
     columns = WIDTH // size
     means2d = gaussians["means2d"][0].double()
     radii = gaussians["radii"][0, :, None].double()

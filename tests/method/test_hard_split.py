@@ -173,7 +173,8 @@ def test_growth_is_chosen_one_by_one_from_the_largest_violation():
 def test_a_cap_under_the_initial_number_stops_growth_only():
     params = random_params(30)
     start = params["means"].detach().clone()
-    assert train(short(max_gaussians=20), params) == [30] * 22
+    actual = train(short(max_gaussians=20), params)
+    assert actual == [30] * 22
     assert not torch.equal(params["means"], start)
     for p in params.values():
         assert p.isfinite().all()

@@ -405,7 +405,8 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
     optimizers = adam(params, lr=0.0)
     keep = params["means"].detach()[1:].clone()
     short().for_run(3000).densify(params, optimizers, state, 9, [])
-    assert_close(params["means"].detach(), keep)
+    actual = params["means"].detach()
+    assert_close(actual, keep)
 
 
 def test_pruning_never_leaves_nothing():
@@ -477,7 +478,8 @@ def test_absgs_leaves_statistics_with_the_gaussians_that_were_observed(long_axis
     state = gradient_state([3e-4, 0.0, 0.0], [0.0, 9e-4, 1e-4]) | empty_statistics(3, torch.device("cpu"))
     for name in ("n_high", "eta_max", "n_total"):
         state[name] += torch.tensor([1.0, 20.0, 3.0]).view(3, *[1] * (state[name].dim() - 1))
-    assert grow_with(params, state, long_axis=long_axis) == (1, 1)
+    actual = grow_with(params, state, long_axis=long_axis)
+    assert actual == (1, 1)
     assert state["n_total"].tolist() == [1, 3, 0, 0, 0], "the cloned, the one left whole, the clone, two children"
     for name in ("n_high", "n_low", "eta_max"):
         assert not state[name][2:].any()

@@ -201,7 +201,8 @@ def colours_in_names(folder: Path, i: int, photo: Image.Image) -> None:
 )
 def test_ordinary_photos_stay(shot: Draw, tmp_path: Path):
     names = draw(tmp_path, shot)
-    assert look_into(tmp_path, tmp_path / "out") == (names, {}, [])
+    actual = look_into(tmp_path, tmp_path / "out")
+    assert actual == (names, {}, [])
 
 
 def test_photos_that_a_scene_has_stay(tmp_path: Path):
@@ -211,7 +212,8 @@ def test_photos_that_a_scene_has_stay(tmp_path: Path):
     settings.parent.mkdir(parents=True)
     write_json(settings, {"photos": known})
     found, _, told = look_into(tmp_path, tmp_path / "out")
-    assert [name for name in found if "_T." in name] == known
+    actual = [name for name in found if "_T." in name]
+    assert actual == known
     assert told == [THERMAL.format(2, "DJI_20260501100003_0002_T.JPG")]
 
 
@@ -220,7 +222,8 @@ def test_thermal_images_that_are_added_to_thermal_ones_stay(tmp_path: Path):
     settings = tmp_path / "out/work/settings.json"
     settings.parent.mkdir(parents=True)
     write_json(settings, {"photos": names[:3]})
-    assert look_into(tmp_path, tmp_path / "out") == (names, {}, [])
+    actual = look_into(tmp_path, tmp_path / "out")
+    assert actual == (names, {}, [])
 
 
 def test_a_damaged_photo_among_bands_is_left_to_be_named(tmp_path: Path):

@@ -169,7 +169,8 @@ def test_the_first_photos_of_16_bits_decide_also_if_they_are_added(tmp_path: Pat
     assert main(command) == 0
     write(photos, a=stored(4095), b=stored(819))
     assert main(command) == 0
-    assert left(taken[1].pixels["b.png"]) == [51, 51, 51]
+    actual = left(taken[1].pixels["b.png"])
+    assert actual == [51, 51, 51]
 
 
 @pytest.mark.parametrize("opaque", [65535, 4095])

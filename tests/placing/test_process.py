@@ -624,7 +624,8 @@ def test_hidden_files_and_folders_named_as_photos_are_no_photos(tmp_path: Path):
     black(tmp_path, "a.png", "b.png", "c.png", "._a.png", ".thumbnails/a.png", "folder.png/d.png")
     (tmp_path / "around").symlink_to(tmp_path)
     names = ["a.png", "b.png", "c.png", "folder.png/d.png"]
-    assert find_source(tmp_path, tmp_path / "out") == (names, False, {}, [])
+    actual = find_source(tmp_path, tmp_path / "out")
+    assert actual == (names, False, {}, [])
     names.append("shot at 3.04\u202fPM \N{FAMILY}\u200d.png")
     black(tmp_path, names[-1])
     assert find_source(tmp_path, tmp_path / "out")[0] == names
@@ -662,7 +663,8 @@ def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path, 
     names = ["a.png", "day/c.png", "day/sub/d.png", "sub/b.png"]
     left_out = ["Left out as folders that cannot be read: 1, such as locked."]
     for source in (photos, Path(os.path.relpath(photos))):
-        assert find_source(source, tmp_path / "out") == (names, False, {}, left_out)
+        actual = find_source(source, tmp_path / "out")
+        assert actual == (names, False, {}, left_out)
 
 
 @pytest.mark.hard_case("the output folder is a loop of links", "one sentence")
@@ -898,7 +900,8 @@ def test_photos_that_windows_numbered_are_no_copies_and_have_their_own_masks(tmp
     names = [f"room ({i}).jpg" for i in range(1, 4)]
     masks = {name: f"masks/{Path(name).stem}.png" for name in names}
     told = ["Left out as copies of others: 1, such as room (9).jpg."]
-    assert look_into(tmp_path, tmp_path / "out") == (names, masks, told)
+    actual = look_into(tmp_path, tmp_path / "out")
+    assert actual == (names, masks, told)
 
 
 def test_a_mistake_of_ours_is_not_taken_for_a_damaged_photo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -1213,7 +1216,8 @@ def test_heic_is_read_as_a_phone_means_it(tmp_path: Path):
     with Image.open(folder / converted.name) as image:
         assert image.format == "JPEG"
         assert image.size == (48, 64)
-        assert image.getexif().get(0x112, 1) == 1
+        actual = image.getexif().get(0x112, 1)
+        assert actual == 1
         for place, color in {(24, 10): (20, 60, 220), (24, 54): (200, 40, 10)}.items():
             assert np.abs(np.array(image)[place[::-1]].astype(int) - color).max() <= 8
 
@@ -1546,7 +1550,8 @@ def record(path: Path, codec: str, kind: str, levels: Sequence[int], options: di
 def test_a_film_gives_its_frames_whatever_its_header_says(name, codec, kind, options, tmp_path: Path):
     film = record(tmp_path / name, codec, kind, range(0, 240, 20), options)
     frames = list(video_frames(film, [], 6))
-    assert [name for name, _ in frames] == [f"{i:05d}.jpg" for i in range(6)]
+    actual = [name for name, _ in frames]
+    assert actual == [f"{i:05d}.jpg" for i in range(6)]
     for i, (_, frame) in enumerate(frames):
         assert frame.shape == (32, 48, 3)
         assert min(abs(frame[24:, 24:].mean() - level) for level in (40 * i, 40 * i + 20)) < 6
@@ -1570,7 +1575,8 @@ def test_frames_are_turned_as_players_show_them(matrix: tuple[int, ...], corner:
     redness = frame[:, :, 2].astype(int) - frame[:, :, 1]
     quarters = [redness[: height // 2], redness[height // 2 :]]
     red = [[half[:, : width // 2].mean(), half[:, width // 2 :].mean()] for half in quarters]
-    assert np.unravel_index(np.argmax(red), (2, 2)) == corner
+    actual = np.unravel_index(np.argmax(red), (2, 2))
+    assert actual == corner
 
 
 @pytest.mark.hard_case("interlaced videos, as camcorders record them", "frames have no edges like combs")
@@ -1888,7 +1894,8 @@ def test_an_added_photo_of_another_size_has_a_camera_of_its_own(grown: tuple[Pat
     # Without distortion, an image can be a column narrower than its photo.
     assert "w" not in described
     assert widths.pop("images/09.png") in (119, 120)
-    assert set(widths.values()) == {before["w"]}
+    actual = set(widths.values())
+    assert actual == {before["w"]}
 
 
 @pytest.mark.hard_case(

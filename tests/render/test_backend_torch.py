@@ -259,8 +259,10 @@ def test_absgrad_sums_the_absolute_gradients_of_the_pixels() -> None:
             (gradient,) = torch.autograd.grad(loss, means2d)
             total += gradient
             absolute += gradient.abs()
-    assert_close(info["means2d"].grad[0], total)
-    assert_close(info["means2d"].absgrad[0], absolute)
+    actual = info["means2d"].grad[0]
+    assert_close(actual, total)
+    actual = info["means2d"].absgrad[0]
+    assert_close(actual, absolute)
     assert (absolute > total.abs() + 1e-3).any()
 
 
@@ -285,8 +287,10 @@ def test_info_has_keys_and_shapes_of_gsplat(per_axis: bool) -> None:
         "opacities": (1, n),
     }
     numbers = {"width": 37, "height": 29, "n_cameras": 1}
-    assert {name: tuple(info[name].shape) for name in shapes} == shapes
-    assert {name: info[name] for name in numbers} == numbers
+    actual = {name: tuple(info[name].shape) for name in shapes}
+    assert actual == shapes
+    actual = {name: info[name] for name in numbers}
+    assert actual == numbers
     assert info["radii"].dtype == torch.int32
     assert info["flatten_ids"].dim() == 1
     assert set(info) == set(shapes) | set(numbers) | {"flatten_ids"}

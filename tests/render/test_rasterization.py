@@ -37,7 +37,8 @@ def test_the_backend_follows_the_device(
     wanted: Any, device: str, triton: bool, chosen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     devices_have(monkeypatch, triton)
-    assert rasterization.choose_backend(wanted, torch.device(device)) == chosen
+    actual = rasterization.choose_backend(wanted, torch.device(device))
+    assert actual == chosen
 
 
 @pytest.mark.parametrize(("wanted", "device"), [("gsplat", "cpu"), ("triton", "cpu"), ("triton", "cuda")])

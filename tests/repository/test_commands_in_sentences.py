@@ -394,7 +394,8 @@ def test_a_new_command_is_found(tmp_path: Path):
     source.write_text(
         'def f(x):\n    """Run `sadgs-process NOT THIS`."""\n    return f"call `sadgs-export {x} --new`"\n'
     )
-    assert [command for text in texts(source) for command in commands_in(text)] == ["sadgs-export … --new"]
+    actual = [command for text in texts(source) for command in commands_in(text)]
+    assert actual == ["sadgs-export … --new"]
 
 
 @pytest.mark.parametrize("command", FILLED)
@@ -438,4 +439,5 @@ def test_the_doctor_s_next_command_reads_the_data(
     config = read_options(words[2:])
     manager: Any = config.pipeline.datamanager
     manager.data = config.data
-    assert [finding for finding in check_capture(manager) if finding.severity != "note"] == []
+    actual = [finding for finding in check_capture(manager) if finding.severity != "note"]
+    assert actual == []

@@ -165,7 +165,8 @@ def test_presets_have_their_own_names_and_every_optimizer(name: str):
     assert method.config.method_name == name
     assert method.description.startswith("Structure-aware densification")
     groups = set(model(dataclasses.replace(SadgsModelConfig(), num_random=10)).gauss_params)
-    assert set(method.config.optimizers) == groups | {"poses", "color_matrices"}
+    actual = set(method.config.optimizers)
+    assert actual == groups | {"poses", "color_matrices"}
 
 
 def test_presets_differ_where_their_comments_say():
@@ -224,7 +225,8 @@ def test_the_help_shows_what_users_of_splatfacto_look_for_and_of_optimizers_only
     hidden = re.compile(
         "warmup|downscale|mixed-precision|logging|accumulation|collider|prompt|eps$|max-norm|weight-decay|share-url"
     )
-    assert [name for name in options if hidden.search(name)] == []
+    actual = [name for name in options if hidden.search(name)]
+    assert actual == []
     rates = {name.rpartition(".")[2] for name in options if name.startswith("--optimizers.")}
     assert rates == {"lr", "final-factor"}
 
@@ -305,7 +307,8 @@ def test_small_images_bound_the_number_of_starting_points(capsys: pytest.Capture
     assert number(100_000, random_init=True) == 2000
     everything = 3000 + 6 * 16**2
     assert number(10**9) == number(None) == number(100_000, starts_per_pixel=0.0) == everything
-    assert number(10**9, random_init=True) == 50_000
+    actual = number(10**9, random_init=True)
+    assert actual == 50_000
     printed = capsys.readouterr().out
     assert printed == ""
 
@@ -399,7 +402,8 @@ def test_an_installation_holds_every_module_and_nothing_that_measures(tmp_path: 
     assert build.returncode == 0, build.stderr
     assert (installed / "sadgs_ns/py.typed").is_file()
     modules = {path.relative_to(CHECKOUT) for path in CHECKOUT.glob("sadgs_ns/**/*.py")}
-    assert {path.relative_to(installed) for path in installed.glob("**/*.py")} == modules
+    actual = {path.relative_to(installed) for path in installed.glob("**/*.py")}
+    assert actual == modules
 
 
 def requirements(lines: list[str]) -> set[str]:
@@ -442,10 +446,12 @@ def test_continuous_integration_runs_what_ci_run_does_on_every_python():
 def test_pre_commit_checks_what_make_lint_does():
     hooks = yaml.safe_load((CHECKOUT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
     lint = (CHECKOUT / "Makefile").read_text().partition("\nlint:")[2].partition("\n\n")[0]
-    assert [" ".join(hook["entry"].split()[:2]) for hook in hooks] == [
+    actual = [" ".join(hook["entry"].split()[:2]) for hook in hooks]
+    assert actual == [
         ".venv/bin/ruff check", ".venv/bin/ruff format", ".venv/bin/pyright --pythonpath"
     ]  # fmt: skip
-    assert re.findall(r"\$\(BIN\)/(\w+ \S+)", lint) == ["ruff check", "ruff format", "pyright --pythonpath"]
+    actual = re.findall(r"\$\(BIN\)/(\w+ \S+)", lint)
+    assert actual == ["ruff check", "ruff format", "pyright --pythonpath"]
 
 
 def test_the_papers_presets_are_sadgs_without_what_we_added():

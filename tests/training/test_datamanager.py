@@ -344,7 +344,8 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     outputs = datamanager.train_dataparser_outputs
     homogeneous = torch.cat([torch.tensor(POSITIONS), torch.ones(3, 1)], dim=1)
     expected = (homogeneous @ outputs.dataparser_transform.T.double() * outputs.dataparser_scale).float()
-    assert_close(outputs.metadata["points3D_xyz"], expected)
+    actual = outputs.metadata["points3D_xyz"]
+    assert_close(actual, expected)
     assert outputs.metadata["points3D_rgb"].tolist() == COLORS.tolist()
 
 
@@ -453,7 +454,8 @@ def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp
 def test_points_without_colours_are_noted(colors: np.ndarray | None, tmp_path: Path):
     ply_scene(tmp_path, colors=colors)
     notes = [finding.sentence for finding in check_ply(tmp_path / "points.ply", [], "restore it")]
-    assert any("without colours" in note for note in notes) == (colors is None)
+    actual = any("without colours" in note for note in notes)
+    assert actual == (colors is None)
 
 
 @pytest.mark.hard_case("a splat's PLY as points", "read with its colours of degree 0")

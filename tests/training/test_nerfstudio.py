@@ -212,7 +212,8 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(colmap: ColmapDataParse
     resumed = train(resumed_config, lambda trainer: steps.append(trainer.step))
 
     assert steps == list(range(middle + 1, last + 1))
-    assert differences(checkpoint(resumed, last), expected) == []
+    actual = differences(checkpoint(resumed, last), expected)
+    assert actual == []
     assert differences(stopped, expected) != []
 
 
@@ -356,7 +357,8 @@ def test_resuming_a_finished_run_trains_no_further(finished: Path, colmap: Colma
     (path,) = config.load_dir.iterdir()
     saved = torch.load(path, weights_only=True)
     assert steps == []
-    assert differences(checkpoint(trainer, ITERATIONS - 1)["pipeline"], saved["pipeline"]) == []
+    actual = differences(checkpoint(trainer, ITERATIONS - 1)["pipeline"], saved["pipeline"])
+    assert actual == []
 
 
 def test_max_gaussians_is_never_exceeded(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -492,7 +494,8 @@ def test_the_seed_decides_the_order_of_the_views(colmap: ColmapDataParserConfig,
         config.machine.seed = seed
         orders.append(set_up(config).pipeline.views.sampler.draw(TRAIN_VIEWS))
     assert orders[0] != orders[1] == orders[2]
-    assert sorted(orders[0]) == sorted(orders[1])
+    actual = sorted(orders[0])
+    assert actual == sorted(orders[1])
 
 
 # --- checkpoints ---
@@ -642,7 +645,8 @@ def test_transparent_images_train_in_front_of_the_background(tmp_path: Path):
     assert (target[:, : WIDTH // 2] == 1).all()
     assert target[:, WIDTH // 2 :].amin() < 1
     model.set_background(torch.zeros(3))  # as the viewer does whenever it draws
-    assert_close(trainer.pipeline.structure_cache.photo(data), target)
+    actual = trainer.pipeline.structure_cache.photo(data)
+    assert_close(actual, target)
     trainer.train()
     assert is_finite(model)
 
@@ -718,7 +722,8 @@ def test_training_evaluation_and_a_loaded_run_draw_from_the_same_plane(finished:
         viewmat = viewmats_from_camera_to_world(pose).to(model.device)
         Ks = cameras.get_intrinsics_matrices()[:1].to(model.device)
         _, _, info = model.render(Pinholes(viewmat, Ks, WIDTH, HEIGHT), model.color_options())
-        assert int(visible(info).sum()) == drawn
+        actual = int(visible(info).sum())
+        assert actual == drawn
 
 
 def test_a_plane_that_is_given_is_kept_also_where_the_checkpoint_has_another(

@@ -36,7 +36,8 @@ NOTHING = torch.ones(0, dtype=torch.bool)
     ],
 )
 def test_a_sentence_says_what_each_option_takes(cleaning: Cleaning, num_removed: dict[str, int], told: list[str]):
-    assert removal_sentences(cleaning, Remaining(NOTHING, num_removed, num_views=5)) == told
+    actual = removal_sentences(cleaning, Remaining(NOTHING, num_removed, num_views=5))
+    assert actual == told
 
 
 @pytest.mark.parametrize(

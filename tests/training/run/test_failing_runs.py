@@ -341,8 +341,10 @@ def test_a_full_disk_leaves_the_previous_checkpoint_and_ends_training_with_one_s
         trainer.train()
     names = [path.name for path in trainer.checkpoint_dir.iterdir()]
     assert names == ["step-000000001.ckpt"]
-    assert differences(checkpoint(trainer, 1), before) == []
-    assert list(config.output_dir.rglob("*.partial")) == []
+    actual = differences(checkpoint(trainer, 1), before)
+    assert actual == []
+    actual = list(config.output_dir.rglob("*.partial"))
+    assert actual == []
 
 
 @pytest.mark.hard_case("the disk is full in a logger (tensorboard)", "the run ends with the file's name")
@@ -507,7 +509,8 @@ def test_one_whole_checkpoint_among_damaged_ones_is_enough(saved: Path, tmp_path
 def test_a_file_of_the_user_s_among_checkpoints_is_passed_over_and_kept(name: str, saved: Path, tmp_path: Path):
     for path in (saved.name, name):
         shutil.copy(saved, tmp_path / path)
-    assert checkpoints.checkpoint_paths(tmp_path, None, None) == [tmp_path / saved.name]
+    actual = checkpoints.checkpoint_paths(tmp_path, None, None)
+    assert actual == [tmp_path / saved.name]
     checkpoints.write(tmp_path, 9, {}, keep=False)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"step-000000009.ckpt", name}
@@ -520,8 +523,10 @@ def test_a_step_or_file_without_a_checkpoint_is_named(saved: Path, tmp_path: Pat
     with refusal(r"\S+/none\.ckpt is no file: give --load-checkpoint one"):
         checkpoints.checkpoint_paths(None, None, tmp_path / "none.ckpt")
     for step in (None, 5):
-        assert checkpoints.checkpoint_paths(saved.parent, step, None) == [saved]
-    assert checkpoints.checkpoint_paths(None, None, None) == []
+        actual = checkpoints.checkpoint_paths(saved.parent, step, None)
+        assert actual == [saved]
+    actual = checkpoints.checkpoint_paths(None, None, None)
+    assert actual == []
 
 
 @pytest.mark.hard_case(

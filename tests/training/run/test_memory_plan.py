@@ -191,7 +191,8 @@ def test_a_structure_tensor_that_is_computed_late_has_its_room_beside_the_gaussi
 
 def test_without_cuda_nothing_changes():
     size = TrainingSize(1e9, StepSize(1, 10**6, 10**6))
-    assert fit_to_memory(DEFAULT, params(), size, 0.1) == (  # type: ignore[arg-type]
+    actual = fit_to_memory(DEFAULT, params(), size, 0.1)
+    assert actual == (  # type: ignore[arg-type]
         DEFAULT,
         "At most 4,000,000 Gaussians: this device's memory is not planned with, so this is max_gaussians.",
     )
@@ -321,7 +322,8 @@ def test_images_are_kept_where_there_is_room(number: int, card: Any, monkeypatch
         assert storage.sentence.startswith(compressed)
         assert f" take {image_bytes(large) / 1e9:.2g} GB, and the {name} has " in storage.sentence
     monkeypatch.setattr(host, "available_host_bytes", lambda: 2.01 * image_bytes(large))
-    assert choose_image_storage(large, torch.device("cpu")) == ImageStorage("gpu")  # the training device
+    actual = choose_image_storage(large, torch.device("cpu"))
+    assert actual == ImageStorage("gpu")  # the training device
 
 
 @pytest.mark.parametrize(

@@ -291,9 +291,8 @@ def test_files_that_are_no_config_or_result_are_named(run: tuple[int, Path], tmp
     assert said.startswith(f"{none} cannot be read (No such file or directory): give --load-config the config.yml of a")
     none.write_text("hello")
     assert said_of(ComputePSNR(none)) == "The file that --load-config names is no config.yml of a run: give it one."
-    assert said_of(ComputePSNR(run[1], tmp_path / "results.txt")) == (
-        "--output-path must end with .json: give the file of results another name."
-    )
+    actual = said_of(ComputePSNR(run[1], tmp_path / "results.txt"))
+    assert actual == ("--output-path must end with .json: give the file of results another name.")
 
 
 @pytest.mark.hard_case(
@@ -343,7 +342,8 @@ def test_a_logger_that_cannot_start_is_named(monkeypatch: pytest.MonkeyPatch, tm
     monkeypatch.setitem(sys.modules, "wandb", types.SimpleNamespace(init=init))
     with pytest.raises(RuntimeError) as failed:
         writer.setup_event_writer(True, False, False, log_dir=tmp_path, experiment_name="test")
-    assert errors.sentence_of(failed.value) == (
+    actual = errors.sentence_of(failed.value)
+    assert actual == (
         "The logger that --vis names could not start (No API key configured): log in to its service, or choose another "
         "--vis."
     )

@@ -93,7 +93,8 @@ def kill_and_resume(*arguments: object) -> str:
 def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
     sizes = ("--kills", 4, "--iterations", 24, "--save-every", 4, "--width", 48, "--views", 10)
     printed = kill_and_resume(tmp_path, *sizes)
-    assert re.findall(r"kill \d: .*, (.*), iteration .*: exit -9", printed) == [
+    actual = re.findall(r"kill \d: .*, (.*), iteration .*: exit -9", printed)
+    assert actual == [
         "within a step",
         "after a split",
         "saving",
@@ -274,7 +275,8 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     with pytest.raises(SystemExit) as stopped:
         trainer.train()
     assert stopped.value.code == 128 + number
-    assert [signal.getsignal(n) for n in SIGNALS] == handlers
+    actual = [signal.getsignal(n) for n in SIGNALS]
+    assert actual == handlers
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
     line = one_line(capsys.readouterr().out, number.name)
     assert line == (
@@ -705,7 +707,8 @@ def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked
     config.pipeline.effort = 1.0
     config.max_num_iterations = 7
     config.pipeline.views_per_iteration = 3
-    assert length_of(set_up(config)) == Schedule(iterations=7, views_per_iteration=3)
+    actual = length_of(set_up(config))
+    assert actual == Schedule(iterations=7, views_per_iteration=3)
 
 
 @pytest.mark.hard_case(

@@ -284,7 +284,8 @@ def test_training_is_the_same_bit_for_bit_wherever_images_are_kept(data: str, tm
             if isinstance(expected[name], torch.Tensor):
                 assert torch.equal(state[name], expected[name]), name
         assert torch.equal(state["_extra_state"]["torch"], expected["_extra_state"]["torch"])
-        assert views_to_come(state["_extra_state"]["views"]) == views_to_come(expected["_extra_state"]["views"])
+        actual = views_to_come(state["_extra_state"]["views"])
+        assert actual == views_to_come(expected["_extra_state"]["views"])
 
 
 def views_to_come(state: dict[str, Any]) -> list[int]:

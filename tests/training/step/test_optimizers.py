@@ -162,7 +162,8 @@ def test_gradients_that_are_not_finite_are_named_and_left_out():
     for training in trainings:
         for step, wrong in enumerate((None, torch.nan, 1e30, None)):
             training.step(step, wrong)
-        assert [step for step, _, _ in training.log.read()] == [1, 2]
+        actual = [step for step, _, _ in training.log.read()]
+        assert actual == [1, 2]
         for _, value in training.tensors():
             assert value.isfinite().all()
     apart, together, by_torch = trainings

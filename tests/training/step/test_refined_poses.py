@@ -124,7 +124,8 @@ def test_gradients_of_rows_that_are_not_finite_count_as_0_and_are_flagged():
     assert table.isfinite().all()
     assert table[1, 2] == 0
     assert table[2, 4] == 0
-    assert int((table == 0).sum()) == 2
+    actual = int((table == 0).sum())
+    assert actual == 2
     assert torch.equal(gradient.nan_to_num(), given.nan_to_num()), "the caller's gradients stay"
 
 
@@ -256,7 +257,8 @@ def test_a_resumed_run_goes_on_with_its_poses_bit_for_bit(colmap: ColmapDataPars
     resumed.load_step = 6
     found = checkpoint(train(resumed), 11)
     for part in ("pipeline", "optimizers", "schedulers"):
-        assert differences(expected[part], found[part]) == []
+        actual = differences(expected[part], found[part])
+        assert actual == []
 
 
 def test_training_views_are_rendered_with_their_refined_poses_and_others_as_they_are(
