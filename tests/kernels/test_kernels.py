@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
@@ -19,7 +17,7 @@ from gsplat.cuda._torch_impl import _spherical_harmonics
 from torch import Tensor
 from torch.testing import assert_close
 
-from helpers import small_scenes
+from helpers import forked_python, small_scenes
 from helpers.closeness import assert_within, assert_within_peak
 from helpers.generators import seeded
 from helpers.gsplat_like import rasterization
@@ -179,11 +177,12 @@ def test_partial_sums_are_added_as_accurately_as_torch_adds_them():
     "a process started with `SADGS_TRITON=0`", "uses no Triton kernel, on whichever device it computes"
 )
 def test_the_environment_switches_the_kernels_off():
-    code = "import torch; from sadgs_ns import kernels; kernels.available = lambda device: True; "
+    code = "import importlib, torch; from sadgs_ns import kernels; importlib.reload(kernels); "  # Reads the switch
+    code += "kernels.available = lambda device: True; "
     code += "print(kernels.switched_off(), kernels.use_triton(torch.device('cuda')), kernels.use_triton(torch.ones(1)))"
     for value, expected in (("0", "True False False"), ("1", "False True True")):
         environment = {**os.environ, kernels.SWITCH: value}
-        process = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+        process = forked_python.python(code, environment)
         assert process.stdout.split("\n")[0] == expected, process.stderr
 
 
