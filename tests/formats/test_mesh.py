@@ -153,8 +153,8 @@ def test_foreign_readers_read_the_file(tmp_path: Path):
     assert_array_equal(read.vertices, vertices)  # type: ignore[union-attr]
     assert_array_equal(read.faces, triangles)  # type: ignore[union-attr]
     colors = np.rint(255 * vertices / 20)
-    actual = read.visual.vertex_colors[:, :3]
-    assert_array_equal(actual, colors)  # type: ignore[union-attr]
+    actual = read.visual.vertex_colors[:, :3]  # type: ignore[union-attr]
+    assert_array_equal(actual, colors)
     assert "fused from rendered depth" in PlyData.read(str(path)).comments[0]
     empty = io.BytesIO()
     mesh.write(empty, a_mesh(vertices[:0], triangles[:0]))
