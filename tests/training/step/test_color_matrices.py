@@ -7,7 +7,10 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.training.step import color_matrices
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
@@ -19,7 +22,7 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 def random_views(views: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Renderings [C, H, W, 3], opacities [C, H, W, 1], matrices [C, 3, 4] and gradients of the result [C, H, W, 3]."""
-    generator = torch.Generator().manual_seed(height)
+    generator = seeded(height)
     shapes = ((views, height, width, 3), (views, height, width, 1), (views, 3, 4), (views, height, width, 3))
     render, alpha, changes, upstream = (torch.rand(shape, generator=generator) for shape in shapes)
     return render, alpha, torch.eye(3, 4) + 0.3 * (changes - 0.5), upstream - 0.5
@@ -44,7 +47,7 @@ def test_colours_and_all_gradients_equal_the_float64_reference(
         corrected = function(*inputs)
         corrected.backward(upstream.to(DEVICE, dtype))
         results.append([corrected.detach().double(), *[value.grad.double() for value in inputs]])  # type: ignore[union-attr]
-    torch.testing.assert_close(*results, atol=2e-5, rtol=2e-5)
+    assert_close(*results, atol=2e-5, rtol=2e-5)
 
 
 @pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
@@ -89,14 +92,14 @@ def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.M
 
 
 def test_the_mean_of_all_views_matrices_is_the_identity():
-    matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=torch.Generator().manual_seed(0))).requires_grad_()
+    matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=seeded(0))).requires_grad_()
     every = anchored(matrices, torch.arange(7))
     actual = every.mean(dim=0)
     expected = torch.eye(3, 4)
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    assert_within(actual, expected, 1e-6)
     actual = every - every[:1]
     expected = (matrices - matrices[:1]).detach() + 0 * every
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    assert_within(actual, expected, 1e-6)
     chosen = anchored(matrices, torch.tensor([5, 2]))
     assert torch.equal(chosen, every[[5, 2]])
     chosen.sum().backward()
@@ -117,12 +120,12 @@ def test_a_gain_in_linear_light_is_an_affine_map_of_srgb_but_for_the_darkest():
         dark = 1.055 * light ** (1 / 2.4) - 0.055
         factor = gain ** (1 / 2.4)
         expected = factor * dark + 0.055 * (factor - 1)
-        torch.testing.assert_close(bright, expected, atol=1e-6, rtol=0)
+        assert_within(bright, expected, 1e-6)
 
 
 def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure():
     """One scene colour a pixel, and views that show it with gains of mean 1: both are found, up to no common factor."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     truth = 0.1 + 0.6 * torch.rand((1, 8, 8, 3), generator=generator)
     gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.4])
     scene = torch.nn.Parameter(torch.full_like(truth, 0.4))
@@ -137,7 +140,7 @@ def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure()
         shown = correct_colors(scene, alpha, anchored(matrices, torch.tensor([view])))
         (shown - gains[view] * truth).square().mean().backward()
         optimizer.step()
-    torch.testing.assert_close(scene.detach(), truth, atol=0.02, rtol=0)
+    assert_within(scene.detach(), truth, 0.02)
     learned = correct_colors(truth.expand(5, -1, -1, -1), alpha, anchored(matrices, torch.arange(5)).detach())
     expected = gains[:, None, None, None] * truth
-    torch.testing.assert_close(learned, expected, atol=0.03, rtol=0)
+    assert_within(learned, expected, 0.03)
