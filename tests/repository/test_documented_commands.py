@@ -6,22 +6,26 @@ comment `# needs a GPU` in a block marks those that it precedes, or whose line i
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib
 import inspect
 import os
 import re
 import shlex
+import sys
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import PackageNotFoundError, entry_points, requires
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tyro
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from test_commands import PYPROJECT, SCRIPTS
 from test_docs import CHECKOUT, names_in, without_code
 
@@ -30,6 +34,11 @@ from examples.drawn_scene.scene import write_scene
 from helpers import forked_python
 from helpers.small_scenes import HEIGHT, POINTS, WIDTH
 from sadgs_ns.programs import put_ffmpeg_into_path
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "text", "yaml", "{button-link}"}
@@ -181,6 +190,31 @@ def understood(words: Sequence[str], lenient: bool = False) -> Any:
     return parsed.value.args[0]
 
 
+def brought_by(package: str, found: set[str]) -> set[str]:
+    """Add to `found` the installed packages that a package requires, directly or not, and return it."""
+    for text in requires(package) or []:
+        requirement = Requirement(text)
+        name = canonicalize_name(requirement.name)
+        is_needed = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if name in found or not is_needed:
+            continue
+        found.add(name)
+        with contextlib.suppress(PackageNotFoundError):  # Nothing here needed it.
+            brought_by(name, found)
+    return found
+
+
+def test_installing_beside_nerfstudio_names_each_requirement_that_nerfstudio_does_not_bring():
+    named = set()
+    for command in COMMANDS:
+        if command.document == "install.md" and command.words[:2] == ("pip", "install"):
+            packages = [word for word in command.words[2:] if re.match("[a-z]", word) and not word.endswith(".txt")]
+            named |= {canonicalize_name(Requirement(package).name) for package in packages}
+    project = tomllib.loads(PYPROJECT.read_text("utf8"))["project"]
+    required = {canonicalize_name(Requirement(text).name) for text in project["dependencies"]}
+    assert required - brought_by("nerfstudio", {"nerfstudio"}) <= named
+
+
 @pytest.mark.parametrize("command", COMMANDS, ids=str)
 def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(command: Command):
     first = command.words[0]
@@ -189,7 +223,7 @@ def test_a_command_in_a_block_is_understood_and_the_test_that_runs_it_is_there(c
         assert re.search(rf"^{words[1]}:", (CHECKOUT / "Makefile").read_text("utf8"), re.MULTILINE)
     elif first == "pip":
         files = [word for word in words[2:] if re.fullmatch(r"\.|.*\.txt", word)]
-        known = PYPROJECT.read_text("utf8")
+        known = PYPROJECT.read_text("utf8") + (CHECKOUT / "constraints.txt").read_text("utf8")
         assert all((CHECKOUT / file).exists() for file in files)
         assert all(word in known for word in words[2:] if word not in files and not word.startswith("-"))
     elif not command.is_foreign and first != ".ci/run":
