@@ -266,9 +266,9 @@ def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kern
 
 
 def test_what_images_take_more_is_added_to_the_steps():
-    part = Part(JOB, {REFERENCE: None}, {"quantization": TWINS["quantization"]}, is_short=False)
+    part = Part(JOB, {REFERENCE: None}, {"structure_tensor": TWINS["structure_tensor"]}, is_short=False)
     measured = loop()
-    measured.images.update({REFERENCE: 0.5, "quantization": 1.0})
+    measured.images.update({REFERENCE: 0.5, "structure_tensor": 1.0})
     row = kernel_share.rows_of(part, measured)[1]
     assert row["ratio"] == pytest.approx(5.5 / 5)
     assert row["images_seconds"] == 1.0
@@ -287,7 +287,7 @@ def test_one_device_measures_all_kernels_but_those_that_send_and_two_only_these(
     assert names == {REFERENCE, "no kernel", *TWINS} - {"exchange"}
     assert optional.is_short
     assert optional.job.row.overrides["pipeline.model.poses"] == "refined"
-    assert {*optional.twins} == {REFERENCE, "poses", "color_matrices"}
+    assert {*optional.twins} == {REFERENCE, "poses"}
     assert len(kernel_share.parts_of(JOB, 1, (), with_options=False)) == 1
     (part,) = kernel_share.parts_of(JOB, 2, (), with_options=True)
     assert [*part.twins] == [REFERENCE, "exchange"]
@@ -304,14 +304,14 @@ def test_the_table_has_a_line_for_each_kernel_and_columns_for_each_scene():
         ok
         | {"scene": "bonsai", "label": "adam", "ratio": 1.25, "low": 1.2, "high": 1.3, "launches": 41.4}
         | {"launches_with_kernel": 30.0},
-        ok | {"scene": "bonsai", "label": "quantization", "ratio": 1.002},
+        ok | {"scene": "bonsai", "label": "structure_tensor", "ratio": 1.002},
         {"status": "failed", "by": "torch", "scene": "site", "label": "adam", "error": "no"},
     ]
     assert kernel_table.markdown(rows).splitlines() == [
         "| Kernel | In its place | bonsai: loop | launches a step | site: loop | launches a step |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
         "| adam | torch | 1.250 (1.200 to 1.300) | 41 / 30 | failed | – |",
-        "| quantization | torch | 1.002 | – | – | – |",
+        "| structure_tensor | torch | 1.002 | – | – | – |",
     ]
 
 
@@ -337,12 +337,12 @@ def test_the_command_writes_a_row_for_each_kernel(
     (tmp_path / "scene").symlink_to(scene)
     output = tmp_path / "kernels.jsonl"
     words = ["kernels", str(tmp_path / "mine.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
-    words += ["--only", "demo", "--rounds", "1", "--kernels", "adam", "poses", "quantization"]
+    words += ["--only", "demo", "--rounds", "1", "--kernels", "adam", "poses", "structure_tensor"]
     status = bench.main(words)
     assert status == 0, capsys.readouterr().err
     rows = results.read(output)
     labels = [row["label"] for row in rows]
-    assert labels == [REFERENCE, "adam", "quantization", "poses"]
+    assert labels == [REFERENCE, "adam", "structure_tensor", "poses"]
     for row in rows:
         assert row["status"] == "ok"
         assert row["ratio"] > 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
@@ -11,11 +9,7 @@ from torch.testing import assert_close
 
 from helpers.closeness import assert_within
 from helpers.generators import seeded
-from sadgs_ns.kernels import triton_switched
-from sadgs_ns.training.step import color_matrices
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
-
-fused = pytest.importorskip("sadgs_ns.kernels.color_matrices", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -34,12 +28,8 @@ def reference(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
     return linear + torch.einsum("ck,chw->chwk", matrices[..., 3], alpha[..., 0])
 
 
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
 @pytest.mark.parametrize("shape", [(1, 5, 7), (3, 33, 47)], ids=str)
-def test_colours_and_all_gradients_equal_the_float64_reference(
-    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int, int], kernels: bool
-):
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
+def test_colours_and_all_gradients_equal_the_float64_reference(shape: tuple[int, int, int]):
     *values, upstream = random_views(*shape)
     results = []
     for function, dtype in ((correct_colors, torch.float32), (reference, torch.float64)):
@@ -50,11 +40,7 @@ def test_colours_and_all_gradients_equal_the_float64_reference(
     assert_close(*results, atol=2e-5, rtol=2e-5)
 
 
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
-def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
-    monkeypatch: pytest.MonkeyPatch, kernels: bool
-):
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
+def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other():
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 33, 47))
     results = []
     for learned in (True, False):
@@ -69,19 +55,8 @@ def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
         assert torch.equal(expected, found)
 
 
-def test_the_kernel_is_what_is_compared(monkeypatch: pytest.MonkeyPatch):
-    called: list[Any] = []
-    monkeypatch.setattr(fused, "correct_colors", lambda *values: called.append(values))
-    for on in (True, False):
-        with triton_switched(on):
-            correct_colors(*random_views(1, 2, 2)[:3])
-    assert len(called) == 1
-
-
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
-def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.MonkeyPatch, kernels: bool):
+def test_what_is_not_drawn_stays_black_and_teaches_nothing():
     """A step without enough places in its tile lists draws nothing, which no matrix may learn to brighten."""
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 6, 9))
     matrices.requires_grad_()
     corrected = correct_colors(torch.zeros_like(render), torch.zeros_like(alpha), matrices)
