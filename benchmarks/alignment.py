@@ -30,7 +30,8 @@ SSIM_WEIGHT = 0.2  # Of the loss, as in 3DGS
 
 def aligned_quality(model: Any, views: Iterable[View], network: Any = None) -> dict[str, Any]:
     """Return what `evaluate.quality` does after aligning each view, by names that begin with `aligned_`."""
-    found = quality(model, ((align(model, view), view[1]) for view in views), network)
+    aligned_views = ((align(model, view), view[1]) for view in views)
+    found = quality(model, aligned_views, network)
     return {f"aligned_{name}": value for name, value in found.items()}
 
 

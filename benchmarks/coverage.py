@@ -52,7 +52,10 @@ def thinned(points: Tensor) -> Tensor:  # points: [P, 3]
     """Return at most MAX_POINTS of the finite points [P, 3], evenly spaced in their order. [Q, 3]"""
     points = points[points.isfinite().all(dim=-1)]
     count = min(len(points), MAX_POINTS)
-    return points[torch.arange(count, device=points.device) * len(points) // max(count, 1)]
+    if count == 0:
+        return points
+    rows = torch.arange(count, device=points.device) * len(points) // count
+    return points[rows]
 
 
 def nearest_angles(held_out: Views, training: Views, points: Tensor) -> Tensor:  # points: [P, 3]

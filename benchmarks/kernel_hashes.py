@@ -32,7 +32,6 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
-from sadgs_ns.training.step.color_matrices import correct_colors
 
 WIDTH = 75
 """Width of the images in px: no multiple of a tile's, or of what a program handles. So is the height."""
@@ -196,17 +195,6 @@ def adam() -> Results:
     return found
 
 
-def color_matrices() -> Results:
-    """Map colours and alphas of views by a matrix for each view."""
-    random = Random(3)
-    inputs = {
-        "render": random.uniform(0.0, 1.0, VIEWS, HEIGHT, WIDTH, 3),
-        "alpha": random.uniform(0.0, 1.0, VIEWS, HEIGHT, WIDTH, 1),
-        "matrices": torch.eye(3, 4) + 0.1 * random.normal(VIEWS, 3, 4),
-    }
-    return with_gradients(random, correct_colors, inputs)
-
-
 def compositing() -> Results:
     """Composite two views, with and without absolute gradients, and with and without gradients of alphas."""
 
@@ -336,11 +324,6 @@ def random_structure_tensors(random: Random) -> Tensor:
     return tensors
 
 
-def quantization() -> Results:
-    """Quantize structure tensors."""
-    return {"bytes": quantize(random_structure_tensors(Random(9)))}
-
-
 def screen_gradients() -> Results:
     """Add the gradients of two backward passes, parts of rows as compositing returns them; some are not finite."""
     found: Results = {}
@@ -449,14 +432,12 @@ def rasterization() -> Results:
 KERNELS: dict[str, Callable[[], Results]] = {
     "activations": activations,
     "adam": adam,
-    "color_matrices": color_matrices,
     "compositing": compositing,
     "exchange": exchange,
     "harmonics": harmonics,
     "losses": losses,
     "projection": projections,
     "projection_forward": forward_projections,
-    "quantization": quantization,
     "screen_gradients": screen_gradients,
     "statistics": statistics,
     "structure_tensor": structure_tensor,

@@ -25,7 +25,9 @@ Job = TypeVar("Job")
 
 def devices_of(gpu: str | None) -> list[str]:
     """Return the GPUs that a run takes together, "0+1" being two; none are named where any will do."""
-    return [] if gpu is None else gpu.split("+")
+    if gpu is None:
+        return []
+    return gpu.split("+")
 
 
 def environment_of(gpu: str | None, site: str | Path | None = None) -> dict[str, str]:

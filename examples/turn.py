@@ -95,15 +95,17 @@ def draw(pipeline: SadgsPipeline, options: Turn) -> list[Picture]:
     poses = cameras.camera_to_worlds.numpy().astype(np.float64)  # [C, 3, 4]
     middle = middle_camera(poses[:, :, 3])
     camera = cameras[middle : middle + 1]
-    camera.rescale_output_resolution(options.width / int(camera.width))
-    means = model.gauss_params["means"].detach().cpu().numpy()
+    factor = options.width / int(camera.width)
+    camera.rescale_output_resolution(factor)
+    gaussians = model.gauss_params
+    means = gaussians["means"].detach().cpu().numpy()
     side = max(int(camera.width), int(camera.height))
     start = start_at(poses[middle], side, float(camera.fx), means)
     target = np.array(start.target)
     pictures = []
-    for pose in ellipse(
-        poses[middle], target, math.radians(options.across), math.radians(options.along), options.frames
-    ):
+    across = math.radians(options.across)
+    along = math.radians(options.along)
+    for pose in ellipse(poses[middle], target, across, along, options.frames):
         camera.camera_to_worlds = torch.from_numpy(pose).to(torch.float32)[None]
         halves = [_picture(model, camera)]
         if options.shrink > 1:
@@ -116,8 +118,9 @@ def draw(pipeline: SadgsPipeline, options: Turn) -> list[Picture]:
 @contextmanager
 def _shrunk(model: SadgsModel, factor: float) -> Iterator[None]:
     """Make the Gaussians so many times smaller, and opaque, while the block runs."""
-    scales = model.gauss_params["scales"].data
-    opacities = model.gauss_params["opacities"].data
+    gaussians = model.gauss_params
+    scales = gaussians["scales"].data
+    opacities = gaussians["opacities"].data
     before = opacities.clone()
     scales -= math.log(factor)
     opacities.fill_(OPAQUE)
@@ -129,8 +132,10 @@ def _shrunk(model: SadgsModel, factor: float) -> Iterator[None]:
 
 
 def _picture(model: SadgsModel, camera) -> Picture:
-    color = model.get_outputs_for_camera(camera.to(model.device))["rgb"]
-    return (255 * color.clamp(0, 1)).round().byte().cpu().numpy()
+    outputs = model.get_outputs_for_camera(camera.to(model.device))
+    color = outputs["rgb"].clamp(0, 1)
+    levels = (255 * color).round()
+    return levels.byte().cpu().numpy()
 
 
 def write(path: Path, pictures: Sequence[Picture], seconds: float, quality: int) -> None:

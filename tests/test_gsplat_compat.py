@@ -14,6 +14,7 @@ import pytest
 import torch
 from gsplat.cuda import _torch_impl
 
+from helpers.generators import seeded
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import ewa
 
@@ -77,7 +78,8 @@ def test_signatures(function: Callable[..., Any]):
     leading, defaults = EXPECTED[function]
     parameters = inspect.signature(function).parameters
     assert " ".join(parameters).startswith(leading)
-    assert {name: parameters[name].default for name in defaults} == defaults
+    actual = {name: parameters[name].default for name in defaults}
+    assert actual == defaults
     required = [name for name, parameter in parameters.items() if parameter.default is inspect.Parameter.empty]
     assert leading.startswith(" ".join(required)), "a parameter without a default is new"
 
@@ -124,7 +126,7 @@ def test_radii_of_the_installed_gsplat_have_the_layout_that_is_stated():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_projection_and_harmonics_in_torch_are_gsplats_bit_by_bit(dtype: torch.dtype):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     means = torch.randn((200, 3), generator=generator, dtype=dtype)
     quats = torch.randn((200, 4), generator=generator, dtype=dtype)
     scales = torch.randn((200, 3), generator=generator, dtype=dtype)

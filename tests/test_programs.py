@@ -90,7 +90,7 @@ def test_a_node_that_cannot_write_pages_is_not_taken(
 ):
     if version == "without npm":
         put_node_into_path(tmp_path / "node.js", "", "", monkeypatch)
-        (tmp_path / "node.js" / "npm").unlink()
+        (tmp_path / "node.js/npm").unlink()
     else:
         put_node_into_path(tmp_path / "node.js", "", "", monkeypatch, version=f"'{version}'")
     assert programs.find_node() == WHEELS_NODE

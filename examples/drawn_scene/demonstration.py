@@ -105,17 +105,21 @@ def train(config: SadgsTrainerConfig, on_step: Callable[[int], None]) -> Run:
     np.random.seed(config.machine.seed)
     trainer: SadgsTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], on_step))
+    location = [TrainingCallbackLocation.AFTER_TRAIN_ITERATION]
+    trainer.callbacks.append(TrainingCallback(location, on_step))
     start = time.perf_counter()
     trainer.train()
-    run = Run(trainer.pipeline, time.perf_counter() - start, [], [])
-    run.pipeline.eval()
-    dataset = run.pipeline.datamanager.eval_dataset
+    seconds = time.perf_counter() - start
+    pipeline = trainer.pipeline
+    pipeline.eval()
+    run = Run(pipeline, seconds, [], [])
+    dataset = pipeline.datamanager.eval_dataset
     for index in range(len(dataset)):
         camera = dataset.cameras[index : index + 1]
-        rendered = run.pipeline.model.get_outputs_for_camera(camera)
+        rendered = pipeline.model.get_outputs_for_camera(camera)
         run.renders.append(rendered["rgb"].cpu())
-        run.targets.append(dataset.get_image_float32(index).cpu())
+        photo = dataset.get_image_float32(index)
+        run.targets.append(photo.cpu())
     return run
 
 
@@ -154,9 +158,11 @@ def draw_side_by_side(path: Path, runs: dict[str, Run]) -> None:
     """Draw a row for each held-out view: its photo, and what each run shows there."""
     panels = []
     for index, photo in enumerate(runs["sadgs"].targets):
-        panels.append(Panel("photo", to_picture(photo)))
+        picture = to_picture(photo)
+        panels.append(Panel("photo", picture))
         for label, run in runs.items():
-            panels.append(Panel(label, to_picture(run.renders[index])))
+            picture = to_picture(run.renders[index])
+            panels.append(Panel(label, picture))
     color_scales.draw(path, panels, columns=1 + len(runs))
 
 
@@ -185,6 +191,8 @@ def demonstrate(output: Path, iterations: int, max_gaussians: int, width: int, h
     console.print("One drawn scene and one seed: an illustration, not a measurement of the method.")
     draw_side_by_side(output / "side_by_side.png", runs)
     draw_wavelength_and_eta(output / "wavelength_and_eta.png", scene, runs)
-    write_gaussians(output / "splat.ply", dict(runs["sadgs"].pipeline.model.gauss_params.items()))
+    model = runs["sadgs"].pipeline.model
+    gaussians = dict(model.gauss_params.items())
+    write_gaussians(output / "splat.ply", gaussians)
     for name in ("side_by_side.png", "wavelength_and_eta.png", "splat.ply"):
         console.print(f"{output / name}")

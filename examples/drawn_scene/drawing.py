@@ -77,14 +77,17 @@ class Rectangle:
             local = origin + t[:, None] * directions - self.corner  # [R, 3]
             u = local @ self.edge_u / (self.edge_u @ self.edge_u)
             v = local @ self.edge_v / (self.edge_v @ self.edge_v)
-            hit = (t > 0) & (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
+            in_u = (u >= 0) & (u <= 1)
+            in_v = (v >= 0) & (v <= 1)
+            hit = (t > 0) & in_u & in_v
         return np.where(hit, t, np.inf)
 
     def colour(self, points: Array) -> Array:
         """Colour in [0, 1] at points on the surface. [P, 3] → [P, 3]"""
         along, across = self._directions
-        a = (points - self.corner) @ along  # [P]
-        b = (points - self.corner) @ across  # [P]
+        local = points - self.corner
+        a = local @ along  # [P]
+        b = local @ across  # [P]
         wave = np.zeros(len(points))
         if self.texture == "grating":
             wave = np.sin(2 * np.pi * a / self.wavelength)
@@ -94,7 +97,9 @@ class Rectangle:
             wave = np.where(square % 2 == 0, 1.0, -1.0)
         dark = np.array(self.dark)
         bright = np.array(self.bright)
-        return dark + (bright - dark) * (0.5 + 0.5 * wave[:, None])
+        contrast = bright - dark
+        share = 0.5 + 0.5 * wave
+        return dark + contrast * share[:, None]
 
     def sample(self, count: int, rng: np.random.Generator) -> Array:
         """Uniform points on the surface. [count, 3]"""
@@ -164,10 +169,13 @@ class View:
 
     def rays(self, supersampling: int = 1) -> Array:
         """Ray directions of s² samples a pixel, row by row, whose ray parameter is the depth. [H·s·W·s, 3]"""
-        x = (np.arange(self.width * supersampling) + 0.5) / supersampling - 0.5 * self.width
-        y = (np.arange(self.height * supersampling) + 0.5) / supersampling - 0.5 * self.height
+        columns = np.arange(self.width * supersampling) + 0.5
+        rows = np.arange(self.height * supersampling) + 0.5
+        x = columns / supersampling - 0.5 * self.width
+        y = rows / supersampling - 0.5 * self.height
         x, y = np.meshgrid(x / self.focal, y / self.focal)
-        return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1) @ self.rotation
+        in_camera = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], -1)
+        return in_camera @ self.rotation
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """World points → pixel positions [P, 2] and depths [P]."""
@@ -235,6 +243,10 @@ def expected_wavelength_map(surfaces: Sequence[Surface], view: View) -> NDArray[
 def visible(surfaces: Sequence[Surface], view: View, points: Array) -> NDArray[np.bool_]:
     """Which points [P, 3] on the surfaces the view sees. [P]"""
     pixels, depth = view.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(1) & (pixels < [view.width, view.height]).all(1)
+    size = [view.width, view.height]
+    after_start = (pixels >= 0).all(1)
+    before_end = (pixels < size).all(1)
+    inside = (depth > 0) & after_start & before_end
     _, nearest = trace(surfaces, view.position, points - view.position)
-    return inside & (nearest > 1 - 1e-4)  # the ray's parameter is 1 at the point itself
+    reached = nearest > 1 - 1e-4  # the ray's parameter is 1 at the point itself
+    return inside & reached

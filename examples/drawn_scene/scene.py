@@ -62,7 +62,8 @@ def _box(name: str, centre: tuple[float, float], size: tuple[float, float, float
     x = np.array([cosine, sine, 0.0]) * size[0]
     y = np.array([-sine, cosine, 0.0]) * size[1]
     z = np.array([0.0, 0.0, size[2]])
-    low = np.array([*centre, 0.0]) - 0.5 * (x + y)
+    foot = np.array([*centre, 0.0])
+    low = foot - 0.5 * (x + y)
     faces = [
         ("front", low, x, z),
         ("left", low, y, z),
@@ -88,6 +89,10 @@ def room_surfaces() -> tuple[Surface, ...]:
     return (floor, fine_wall, coarse_wall, *tall_box, *faint_box, sphere)
 
 
+_STEPS = np.array([0.8191725134, 0.6710436067, 0.5497004779])
+"""Of a low-discrepancy sequence of three numbers."""
+
+
 def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
     """Cameras spread over a patch of a sphere about the room's middle, all looking at it.
 
@@ -97,16 +102,19 @@ def arc_views(count: int, width: int, height: int) -> tuple[View, ...]:
     target = np.array([0.85, 0.85, 0.55])
     views = []
     for index in range(count):
-        across, up, away = (0.5 + index * np.array([0.8191725134, 0.6710436067, 0.5497004779])) % 1.0
+        place = 0.5 + index * _STEPS
+        across, up, away = place % 1.0
         azimuth = np.radians(14 + 62 * across)
         elevation = np.radians(12 + 33 * up)
-        x = np.cos(elevation) * np.cos(azimuth)
-        y = np.cos(elevation) * np.sin(azimuth)
+        level = np.cos(elevation)
+        x = level * np.cos(azimuth)
+        y = level * np.sin(azimuth)
         z = np.sin(elevation)
         outward = np.array([x, y, z])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         rotation = np.stack([right, np.cross(-outward, right), -outward])
-        position = target + (2.3 + 0.6 * away) * outward
+        distance = 2.3 + 0.6 * away
+        position = target + distance * outward
         translation = -rotation @ position
         views.append(View(f"{index:03d}.png", rotation, translation, 0.8 * width, width, height))
     return tuple(views)
@@ -151,7 +159,9 @@ def _write_colmap(scene: SceneDescription, folder: Path) -> None:
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
     first = scene.views[0]
-    intrinsics = np.array([first.focal, first.focal, 0.5 * first.width, 0.5 * first.height])
+    middle_x = 0.5 * first.width
+    middle_y = 0.5 * first.height
+    intrinsics = np.array([first.focal, first.focal, middle_x, middle_y])
     cameras = {1: colmap.Camera(1, "PINHOLE", first.width, first.height, intrinsics)}
     # A point's place in a view's list of keypoints is its rank among the points which that view sees.
     rank = scene.tracks.cumsum(0) - 1  # [P, V]
@@ -160,11 +170,14 @@ def _write_colmap(scene: SceneDescription, folder: Path) -> None:
         seen = np.flatnonzero(scene.tracks[:, index])
         pixels, _ = view.project(scene.points[seen])
         quaternion = colmap.rotmat2qvec(view.rotation)
-        images[index + 1] = colmap.Image(index + 1, quaternion, view.translation, 1, view.name, pixels, seen + 1)
+        number = index + 1
+        images[number] = colmap.Image(number, quaternion, view.translation, 1, view.name, pixels, seen + 1)
     points = {}
     for index, (position, colour) in enumerate(zip(scene.points, scene.colours, strict=True)):
         seen = np.flatnonzero(scene.tracks[index])
-        points[index + 1] = colmap.Point3D(index + 1, position, colour, 0.5, seen + 1, rank[index, seen])
+        keypoints = rank[index, seen]
+        number = index + 1
+        points[number] = colmap.Point3D(number, position, colour, 0.5, seen + 1, keypoints)
     folder.mkdir(parents=True)
     colmap.write_model(cameras, images, points, str(folder))
 
@@ -205,13 +218,15 @@ def write_scene(
     scene = describe_scene(width, height, views, points, seed)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     try:
-        (partial / "images").mkdir(parents=True)
+        images = partial / "images"
+        images.mkdir(parents=True)
         for view in scene.views:
             image = Image.fromarray(render(scene.surfaces, view))
-            image.save(partial / "images" / view.name)
+            image.save(images / view.name)
         _write_colmap(scene, partial / SPARSE_FOLDER)
         description = {"format": _FORMAT, "wavelengths": scene.wavelengths}
-        (partial / _DESCRIPTION_NAME).write_text(json.dumps(description, indent=2) + "\n")
+        text = json.dumps(description, indent=2)
+        (partial / _DESCRIPTION_NAME).write_text(f"{text}\n")
         if folder.exists():
             shutil.rmtree(folder)
         partial.rename(folder)

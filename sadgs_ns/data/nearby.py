@@ -122,11 +122,13 @@ def _nearness(missing: Path, path: Path) -> tuple[bool, int, bool]:
     That is the number of folders above both files that have one name, and whether their suffixes have.
     """
     around = next((parent for parent in missing.parents if parent.is_dir()), missing.parent)
-    parents = 0
-    for one, other in zip(
-        reversed(str(missing.parent).replace("\\", "/").split("/")), reversed(path.parent.parts), strict=False
-    ):
+    # A path that Windows wrote has backslashes.
+    missing_folders = str(missing.parent).replace("\\", "/").split("/")
+    folders = path.parent.parts
+    alike = 0
+    for one, other in zip(reversed(missing_folders), reversed(folders), strict=False):
         if _folded(one) != _folded(other):
             break
-        parents += 1
-    return path.is_relative_to(around), parents, missing.suffix.lower() == path.suffix.lower()
+        alike += 1
+    has_suffix = missing.suffix.lower() == path.suffix.lower()
+    return path.is_relative_to(around), alike, has_suffix

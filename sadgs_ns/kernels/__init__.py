@@ -1,4 +1,4 @@
-"""Triton kernels for CUDA, each with a torch function of the same name as its twin; tests compare the two."""
+"""Triton kernels for CUDA. Tests compare each with its twin: a torch function of the same name, or gsplat's code."""
 
 from __future__ import annotations
 
@@ -47,7 +47,9 @@ def use_triton(place: torch.device | Tensor) -> bool:
         if place.dtype != torch.float32:
             return False
         place = place.device
-    return available(place) if _forced is None else _forced
+    if _forced is not None:
+        return _forced
+    return available(place)
 
 
 @contextmanager

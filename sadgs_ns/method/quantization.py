@@ -5,8 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns.kernels import use_triton
-
 INVALID = 255
 """Second byte of a pixel whose S̄ is NaN, such as a masked one; those of correlations end at 254."""
 HIGHEST_FREQUENCY = 4.0
@@ -24,10 +22,6 @@ def quantize(
     S̄ positive semidefinite. S̄ is (xx, xy, yy) in 1/px², finite or NaN; a pixel with a NaN, such as a masked one,
     becomes (0, INVALID, 0). uint8 [..., 3]
     """
-    if use_triton(tensor):
-        from sadgs_ns.kernels import quantization as kernel
-
-        return kernel.quantize(tensor, HIGHEST_FREQUENCY, OCTAVES, INVALID)
     xx, xy, yy = tensor.unbind(-1)
     frequencies = torch.stack([xx, yy], -1).clamp_min(0).sqrt()  # [..., 2] in 1/px
     logarithms = 1 + (frequencies / HIGHEST_FREQUENCY).log2() / OCTAVES  # (−∞, 1]

@@ -152,7 +152,8 @@ def test_the_option_is_part_of_a_run_s_key_only_where_it_is_given():
     plain = protocol.Job(scene, row, 0)
     aligned = protocol.Job(scene, dataclasses.replace(row, aligned=True), 0)
     assert plain.key != aligned.key
-    assert protocol.Row(**dataclasses.asdict(aligned.row)) == aligned.row
+    actual = protocol.Row(**dataclasses.asdict(aligned.row))
+    assert actual == aligned.row
 
 
 def test_the_command_aligns_all_rows_if_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -163,7 +164,8 @@ def test_the_command_aligns_all_rows_if_asked(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr("benchmarks.datasets.check", lambda *_: None)
     for aligned in (False, True):
         command = Benchmark(file, tmp_path, tmp_path / "rows.jsonl", aligned=aligned)
-        assert [job.row.aligned for job in command.selected()] == [aligned]
+        actual = [job.row.aligned for job in command.selected()]
+        assert actual == [aligned]
 
 
 def test_the_table_has_the_columns_if_a_row_has_them():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import os
 import re
 import signal
@@ -21,8 +20,9 @@ from benchmarks import protocol, results, side_by_side
 from benchmarks.protocol import Job, Row, Scene, set_dotted
 from benchmarks.run import build_config, describe
 from benchmarks.table import markdown
+from helpers.json_files import write_json
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -49,7 +49,8 @@ def result(**changes: Any) -> dict[str, Any]:
 def test_jobs_are_rows_then_scenes_then_seeds():
     rows = [row(label="a"), row(label="b", scenes=["south"], seeds=[7])]
     jobs = protocol.parse(content(rows=rows, seeds=[0, 1])).jobs()
-    assert [(j.row.label, j.scene.name, j.seed) for j in jobs] == [
+    actual = [(j.row.label, j.scene.name, j.seed) for j in jobs]
+    assert actual == [
         ("a", "fox", 0), ("a", "fox", 1), ("a", "south", 0), ("a", "south", 1), ("b", "south", 7),
     ]  # fmt: skip
 
@@ -265,7 +266,7 @@ class FakeRunner:
         (folder / "log").write_text("what it said")
         if job.row.label in self.crashes:
             return subprocess.Popen([sys.executable, "-S", "-c", "raise SystemExit(3)"], start_new_session=True)
-        (folder / "result.json").write_text(json.dumps({"status": "ok", "error": None, "psnr": 30.0}))
+        write_json(folder / "result.json", {"status": "ok", "error": None, "psnr": 30.0})
         return subprocess.Popen(["true"], start_new_session=True)
 
 
@@ -274,7 +275,7 @@ def some_jobs(labels: str = "abc") -> list[Job]:
 
 
 def test_results_are_written_and_done_runs_are_skipped(tmp_path: Path):
-    output = tmp_path / "out" / "results.jsonl"
+    output = tmp_path / "out/results.jsonl"
     log = tmp_path / "results.log"
     jobs = some_jobs()
     runner = FakeRunner(crashes={"b"})
@@ -301,7 +302,8 @@ def test_gpus_are_shared_out(tmp_path: Path):
     runner = FakeRunner()
     seen = []
     bench.run_all(some_jobs("abcd"), runner, seen.append, tmp_path / "log", gpus=["0", "1"], jobs_per_gpu=2)
-    assert [gpu for _, gpu in runner.started] == ["0", "1", "0", "1"]
+    actual = [gpu for _, gpu in runner.started]
+    assert actual == ["0", "1", "0", "1"]
     for r in seen:
         assert r["jobs_per_gpu"] == 2
 
@@ -341,7 +343,7 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
         return process
 
     fox = {"data": "fox", "dataparser": "nerfstudio-data"}
-    (tmp_path / "p.yaml").write_text(json.dumps(content(scenes={"fox": fox})))
+    write_json(tmp_path / "p.yaml", content(scenes={"fox": fox}))
     (tmp_path / "fox").mkdir()
     arguments = [str(tmp_path / "p.yaml"), "--scenes", str(tmp_path), "--output", str(tmp_path / "r.jsonl")]
     before = signal.getsignal(signal.SIGTERM)
@@ -352,7 +354,8 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
     assert processes[0].poll() is not None
     assert signal.getsignal(signal.SIGTERM) == before
     monkeypatch.setattr(bench, "launcher", lambda root: FakeRunner(crashes={"ours"}))
-    assert bench.main(arguments) == 1
+    status = bench.main(arguments)
+    assert status == 1
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -360,28 +363,30 @@ def test_sigterm_ends_the_runs_and_its_handler_is_the_program_s_again(tmp_path: 
 def test_runs_on_other_numbers_of_devices_are_not_mixed(
     gpus: str, there: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    (tmp_path / "p.yaml").write_text(
-        json.dumps(content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
-    )
+    write_json(tmp_path / "p.yaml", content(scenes={"fox": {"data": "fox", "dataparser": "nerfstudio-data"}}))
     (tmp_path / "fox").mkdir()
     monkeypatch.setattr(bench, "launcher", lambda root: pytest.fail("nothing may start"))
     output = tmp_path / "r.jsonl"
     results.append(output, result(devices=there))
     arguments = ["p.yaml", "--scenes", ".", "--output", str(output), "--gpus", gpus]
     monkeypatch.chdir(tmp_path)
-    assert bench.main(arguments) == 2
-    assert f"and another --output than {output} if that has runs on others" in capsys.readouterr().err
+    status = bench.main(arguments)
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert f"and another --output than {output} if that has runs on others" in errors
 
 
 def test_a_half_written_line_is_ignored_and_swallows_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "results.jsonl"
-    assert results.read(path, missing_ok=True) == []
+    actual = results.read(path, missing_ok=True)
+    assert actual == []
     results.append(path, result(key="a"))
     with path.open("a") as file:
         file.write('{"key": "b", "sta')
     results.append(path, {"key": "of no scene"})
     results.append(path, result(key="c"))
-    assert [r["key"] for r in results.read(path)] == ["a", "c"]
+    keys = [r["key"] for r in results.read(path)]
+    assert keys == ["a", "c"]
     said = capsys.readouterr().err
     assert "results.jsonl:2 is not a result" in said
     assert "results.jsonl:3 is not a result" in said
@@ -396,8 +401,10 @@ def test_wrong_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixtu
         ([str(CONFIGS / "demo-gate.yaml"), "--only", "nothing"], "--only 'nothing' leaves no run"),
         ([str(CONFIGS / "demo-gate.yaml"), "--only", "["], "is not a regular expression"),
     ]:
-        assert bench.main([*arguments, *options]) == 2
-        assert sentence in capsys.readouterr().err
+        status = bench.main([*arguments, *options])
+        assert status == 2
+        errors = capsys.readouterr().err
+        assert sentence in errors
 
 
 # Table
@@ -440,7 +447,8 @@ def test_a_finished_run_is_one_line():
         "fox ours seed 0: loop 10.0 s, PSNR 30.00, SSIM 0.9000, LPIPS 0.1000, 1,000 Gaussians, 2.00 GB"
     )
     assert bench.line(result(lpips=None, peak_gb=None)).endswith("SSIM 0.9000, 1,000 Gaussians")
-    assert bench.line(result(status="failed", error="no data.")) == "fox ours seed 0: failed: no data."
+    actual = bench.line(result(status="failed", error="no data."))
+    assert actual == "fox ours seed 0: failed: no data."
 
 
 def test_other_commands_are_told_and_reached(capsys: pytest.CaptureFixture[str]):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 import random
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.testing import assert_close
 
 from benchmarks import __main__ as bench
 from benchmarks import curve, evaluate, protocol, run
@@ -27,6 +27,7 @@ from benchmarks.protocol import Job, Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.forked_python import HANGS
 from helpers.gsplat_like import splatted
+from helpers.json_files import read_json
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import RenderOptions
 
@@ -156,7 +157,7 @@ def test_the_curve_changes_nothing_in_the_training(runs: Runs):
         here = measured["pipeline"].get("_extra_state", {}).pop(name, None)
         there = plain["pipeline"].get("_extra_state", {}).pop(name, None)
         assert here == there
-    torch.testing.assert_close(measured, plain, rtol=0, atol=0)
+    assert_close(measured, plain, rtol=0, atol=0)
 
 
 def test_the_curve_ends_in_the_finished_run(runs: Runs):
@@ -165,7 +166,8 @@ def test_the_curve_ends_in_the_finished_run(runs: Runs):
     actual = [set(point) for point in points]
     expected = [{"step", "seconds", "psnr", "ssim", "lpips", "gaussians"}] * 3
     assert actual == expected
-    assert [point["step"] for point in points] == [5, 10, ITERATIONS]
+    steps = [point["step"] for point in points]
+    assert steps == [5, 10, ITERATIONS]
     actual = {name: record[name] for name in ("psnr", "ssim", "lpips", "gaussians")}
     expected = {name: points[-1][name] for name in ("psnr", "ssim", "lpips", "gaussians")}
     assert actual == expected
@@ -244,7 +246,7 @@ def written(root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, A
         patch.setattr(sys, "argv", commands[0][2:])
         run.main()
         assert SadgsModel.populate_modules is populate_slowly, "the run has put it back"
-    return json.loads((folder / "result.json").read_text())
+    return read_json(folder / "result.json")
 
 
 def test_a_record_holds_all_fields(written: dict[str, Any]):
@@ -267,7 +269,7 @@ def test_each_held_out_view_is_told_in_the_order_of_its_psnr(runs: Runs, root: P
     for row in (SPLATFACTO, SADGS):  # The order is that of the loader whose views are evaluated.
         datamanager: Any = run.build_config(SCENE, row, 0, root, tmp_path).pipeline.datamanager.setup(test_mode="test")
         for name, (_, batch) in zip(record["view_names"], datamanager.fixed_indices_eval_dataloader, strict=True):
-            photograph = np.asarray(Image.open(root / "demo" / "images" / f"{name}.png").convert("RGB"))
+            photograph = np.asarray(Image.open(root / "demo/images" / f"{name}.png").convert("RGB"))
             image = batch["image"].cpu().numpy()
             assert np.array_equal(image if image.dtype == np.uint8 else np.rint(image * 255), photograph)
         # Without SfM points the Gaussians' centres stand for them.
@@ -302,7 +304,7 @@ def test_two_processes_train_one_splat_whose_row_the_first_writes(
     }
     with bench.launcher(root)(Job(SCENE, Row("ours", "sadgs", overrides), 0), "0+1", tmp_path) as process:
         assert process.wait(HANGS) == 0, (tmp_path / "log").read_text()
-    record = json.loads((tmp_path / "result.json").read_text())
+    record = read_json(tmp_path / "result.json")
     assert record["status"] == "ok"
     assert record["devices"] == 2
     assert record["iterations"] == ITERATIONS
@@ -382,7 +384,7 @@ def test_curve_every_is_part_of_the_key_only_where_it_is_given():
         {"colmap_path": "sparse/0", "downscale_factor": 1, "eval_mode": "interval", "eval_interval": 8},
     )
     job = Job(bonsai, Row("full", "sadgs-paper-indoor"), 0)
-    assert job.key in (Path(__file__).parents[2] / "docs" / "results" / "claims.jsonl").read_text()
+    assert job.key in (Path(__file__).parents[2] / "docs/results/claims.jsonl").read_text()
 
 
 @pytest.mark.parametrize("wrong", [0, -5, 1.5, "500", True])

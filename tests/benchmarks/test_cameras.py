@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,12 @@ import numpy as np
 import pycolmap
 import pytest
 import yaml
+from numpy.testing import assert_allclose
 
 from benchmarks import camera_measures, camera_run, camera_table, camera_truth, cameras, results, side_by_side
 from benchmarks.camera_measures import leave_out, reprojection_errors
 from helpers.drawn_photos import VIEWS, draw_photos
+from helpers.json_files import write_json
 from sadgs_ns.placing import reconstruct
 from sadgs_ns.placing.agreement import Observed, align, common_points, displacement
 
@@ -42,7 +43,7 @@ def test_a_similarity_is_found_in_spite_of_points_that_moved_elsewhere():
     targets = SIMILARITY * points
     targets[:10] += 3.0
     found = align(points, targets)
-    np.testing.assert_allclose(found.matrix(), SIMILARITY.matrix(), atol=1e-9)
+    assert_allclose(found.matrix(), SIMILARITY.matrix(), atol=1e-9)
 
 
 def test_points_without_a_similarity_are_refused():
@@ -108,7 +109,8 @@ def test_a_tenth_of_the_observations_is_left_out_and_three_of_each_point_stay():
     assert true.compute_num_observations() == before - count
     assert true.num_points3D() == points
     assert min(point.track.length() for point in true.points3D.values()) == 3
-    np.testing.assert_allclose(reprojection_errors(true, left_out), 0.0, atol=1e-6)
+    actual = reprojection_errors(true, left_out)
+    assert_allclose(actual, 0.0, atol=1e-6)
 
 
 def test_points_of_two_or_three_observations_keep_them():
@@ -124,7 +126,7 @@ def test_the_error_of_what_was_left_out_is_its_distance_in_px():
     found = reprojection_errors(true, moved)
     lost = np.array(left_out.point_ids) == left_out.point_ids[0]
     assert np.isnan(found[lost]).all()
-    np.testing.assert_allclose(found[~lost], 5.0, atol=1e-6)
+    assert_allclose(found[~lost], 5.0, atol=1e-6)
 
 
 def test_errors_of_true_cameras_are_those_after_a_similarity():
@@ -228,7 +230,8 @@ def rows(room: Path) -> list[dict[str, Any]]:
 
 
 def test_a_capture_has_a_row_for_each_variant_with_numbers_for_each_seed(rows: list[dict[str, Any]]):
-    assert [row["key"] for row in rows] == ["room/new/released", "room/new/squared"]
+    keys = [row["key"] for row in rows]
+    assert keys == ["room/new/released", "room/new/squared"]
     for row in rows:
         assert row["status"] == "ok", row["error"]
         assert row["seeds"] == [0, 1]
@@ -270,7 +273,8 @@ def test_the_table_has_a_line_for_each_variant(rows: list[dict[str, Any]]):
     assert len(captures) == 4
     assert captures[2].startswith(f"| room | today's | released | {VIEWS} of {VIEWS} | ")
     assert captures[2].endswith(f" | {rows[0]['cores']} | 2 |")
-    assert camera_table.markdown(rows, {"old": "as of then"}) == ""
+    actual = camera_table.markdown(rows, {"old": "as of then"})
+    assert actual == ""
 
 
 def test_tables_show_means_and_the_worst_of_all_pairs_and_no_seconds_of_a_busy_machine():
@@ -319,7 +323,8 @@ def test_what_is_not_there_is_refused(tmp_path: Path):
 def test_photos_that_cannot_be_placed_give_failed_rows(tmp_path: Path):
     (tmp_path / "0.png").write_bytes(b"")
     job = cameras.Job("empty", "new", [0], ["released", "squared"], folder=str(tmp_path))
-    assert [row["status"] for row in cameras.rows_of(job, tmp_path)] == ["failed", "failed"]
+    statuses = [row["status"] for row in cameras.rows_of(job, tmp_path)]
+    assert statuses == ["failed", "failed"]
 
 
 def test_a_capture_that_ends_without_rows_is_a_failed_one_and_what_is_done_is_not_done_again(
@@ -333,7 +338,7 @@ def test_a_capture_that_ends_without_rows_is_a_failed_one_and_what_is_done_is_no
             return subprocess.Popen(["false"], start_new_session=True)
         measured = {"status": "ok", "error": None, "centres": [0.1], "rotations": [0.2]}
         rows = [job.row(variant, "2026-11-27", **measured) for variant in job.variants]
-        (work / "rows.json").write_text(json.dumps(rows))
+        write_json(work / "rows.json", rows)
         return subprocess.Popen(["true"], start_new_session=True)
 
     monkeypatch.setattr(cameras, "_start", start)

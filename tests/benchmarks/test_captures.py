@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import shutil
@@ -17,15 +16,16 @@ from PIL import Image
 from benchmarks import __main__ as benchmarks
 from benchmarks import captures, chain, protocol
 from benchmarks.capture_digests import measure_model, measure_photos
+from helpers.json_files import write_json
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 CAMERAS = ["1 PINHOLE 8 6 10 10 4 3", "2 SIMPLE_RADIAL 8 6 9 4 3 0.01"]
 IMAGES = ["1 1 0 0 0 0 0 1 1 a.png", "2 0.8 0.6 0 0 0.1 0 1 2 b.png", "3 0.6 0 0.8 0 0.2 0 1 1 c.png"]
 POINTS = ["1 0.1 0.2 3 255 0 0 0.5", "2 0.4 0.1 2.5 0 255 0 0.5"]
 
 
 def write_model(scene: Path, images: list[str] = IMAGES, points: list[str] = POINTS) -> None:
-    model = scene / "sparse" / "0"
+    model = scene / "sparse/0"
     model.mkdir(parents=True, exist_ok=True)
     (model / "cameras.txt").write_text("\n".join(CAMERAS) + "\n")
     (model / "images.txt").write_text("".join(f"{image}\n\n" for image in images))
@@ -82,9 +82,9 @@ def test_the_order_of_a_model_and_the_signs_of_its_quaternions_do_not_matter(sce
 def test_a_binary_model_has_the_digests_of_the_text(scene: Path, tmp_path: Path):
     import pycolmap
 
-    binary = tmp_path / "binary" / "sparse" / "0"
+    binary = tmp_path / "binary/sparse/0"
     binary.mkdir(parents=True)
-    pycolmap.Reconstruction(str(scene / "sparse" / "0")).write_binary(str(binary))
+    pycolmap.Reconstruction(str(scene / "sparse/0")).write_binary(str(binary))
     assert (binary / "images.bin").exists() and not (binary / "images.txt").exists()
     assert measure_model(tmp_path / "binary") == measure_model(scene)
 
@@ -94,14 +94,16 @@ def test_the_order_of_frames_in_a_transforms_file_does_not_matter_and_their_list
     content = {"fl_x": 10.0, "train_filenames": ["images/a.png"], "val_filenames": ["images/b.png"]}
     models = []
     for change in ({"frames": frames}, {"frames": frames[::-1]}, {"frames": frames, "val_filenames": ["images/a.png"]}):
-        (tmp_path / "transforms.json").write_text(json.dumps({**content, **change}))
+        write_json(tmp_path / "transforms.json", {**content, **change})
         models.append(measure_model(tmp_path))
     assert models[0] == models[1] != models[2]
 
 
 def test_what_matches_is_told_to_match(scene: Path, described: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("--captures", described, "--check", scene.parent, "--check-photos", scene) == 0
-    assert capsys.readouterr().out == "kitchen: matches\nimages: matches\n"
+    status = run("--captures", described, "--check", scene.parent, "--check-photos", scene)
+    assert status == 0
+    printed = capsys.readouterr().out
+    assert printed == "kitchen: matches\nimages: matches\n"
 
 
 def move_points(scene: Path) -> None:
@@ -109,10 +111,10 @@ def move_points(scene: Path) -> None:
 
 
 CHANGES: dict[str, Callable[[Path], object]] = {
-    "2 photos instead of 3": lambda scene: (scene / "images" / "a.png").unlink(),
-    "the photos have 8×6 and 4×3 px instead of 8×6": lambda scene: write_photo(scene / "images" / "a.png", (4, 3)),
-    "match, but not their names": lambda scene: shutil.move(scene / "images" / "a.png", scene / "images" / "z.png"),
-    "resized or compressed otherwise": lambda scene: write_photo(scene / "images" / "a.png", grey=101),
+    "2 photos instead of 3": lambda scene: (scene / "images/a.png").unlink(),
+    "the photos have 8×6 and 4×3 px instead of 8×6": lambda scene: write_photo(scene / "images/a.png", (4, 3)),
+    "match, but not their names": lambda scene: shutil.move(scene / "images/a.png", scene / "images/z.png"),
+    "resized or compressed otherwise": lambda scene: write_photo(scene / "images/a.png", grey=101),
     "has neither sparse/0 nor transforms.json": lambda scene: shutil.rmtree(scene / "sparse"),
     "but 2 of them have a camera instead of 3": lambda scene: write_model(scene, IMAGES[:2]),
     "their cameras differ": lambda scene: write_model(scene, [IMAGES[0].replace(" 1 1 a", " 2 1 a"), *IMAGES[1:]]),
@@ -126,7 +128,8 @@ def test_what_differs_is_told_in_a_sentence(
     sentence: str, scene: Path, described: Path, capsys: pytest.CaptureFixture[str]
 ):
     CHANGES[sentence](scene)
-    assert run("--captures", described, "--check", scene.parent) == 1
+    status = run("--captures", described, "--check", scene.parent)
+    assert status == 1
     (line,) = capsys.readouterr().out.splitlines()
     assert line.startswith("kitchen: ") and sentence in line and line.endswith(".")
 
@@ -139,8 +142,10 @@ def test_a_capture_that_is_asked_for_by_name_must_be_there(
     described.write_text(yaml.safe_dump(content), "utf8")
     checked = ("--captures", described, "--check", scene.parent)
     assert run(*checked) == 0
-    assert run("kitchen", "garden", *checked) == 1
-    assert capsys.readouterr().out == 2 * f"kitchen: matches\nNot in {scene.parent}: garden\n"
+    status = run("kitchen", "garden", *checked)
+    assert status == 1
+    printed = capsys.readouterr().out
+    assert printed == 2 * f"kitchen: matches\nNot in {scene.parent}: garden\n"
 
 
 @pytest.mark.parametrize(
@@ -155,15 +160,19 @@ def test_a_wrong_name_or_folder_is_refused(
     words: list[str], sentence: str, scene: Path, described: Path, capsys: pytest.CaptureFixture[str]
 ):
     root = str(scene.parent)
-    assert run(*(word.replace("ROOT", root) for word in words), "--captures", described) == 2
-    assert sentence.replace("ROOT", root) in capsys.readouterr().err
+    status = run(*(word.replace("ROOT", root) for word in words), "--captures", described)
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert sentence.replace("ROOT", root) in errors
 
 
 @pytest.mark.parametrize("text", ["scenes: {}", "- fox", "scenes: {fox: {}}\nphotos: {}", "{", "scenes: {fox: 3}"])
 def test_a_file_that_describes_no_captures_is_refused(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "captures.yaml").write_text(text)
-    assert run("--captures", tmp_path / "captures.yaml") == 2
-    assert "must be YAML with scenes and photos: " in capsys.readouterr().err
+    status = run("--captures", tmp_path / "captures.yaml")
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "must be YAML with scenes and photos: " in errors
 
 
 def test_every_capture_is_described_with_source_licence_and_a_command(capsys: pytest.CaptureFixture[str]):
@@ -181,7 +190,7 @@ def test_every_capture_is_described_with_source_licence_and_a_command(capsys: py
 def test_the_protocols_of_the_tables_run_described_captures_alone():
     scenes, photos = captures.load()
     ours = protocol.load(CONFIGS / "ours.yaml")
-    assert set(ours.scenes) <= set(scenes)
+    assert set(ours.scenes) <= {*scenes, *photos}
     assert set(chain.load(CONFIGS / "chain.yaml").captures) <= {*photos, "fox"}
 
 
@@ -194,7 +203,8 @@ def test_each_command_that_repeats_a_capture_runs_it_alone():
         jobs = [
             job for job in protocol.load(path).jobs() if re.search(only, f"{job.scene.name}/{job.row.label}/{job.seed}")
         ]
-        assert {job.scene.name for job in jobs} == {name}
+        actual = {job.scene.name for job in jobs}
+        assert actual == {name}
         assert "sadgs" in {job.row.method for job in jobs}
     for name, capture in photos.items():
         words = shlex.split(capture.repeat.replace("NAME", name))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from numpy.testing import assert_allclose
 from PIL import Image
 from torch.nn import Parameter
 
@@ -20,6 +20,7 @@ from examples import simple_trainer
 from examples.drawn_scene.drawing import View, render
 from examples.drawn_scene.scene import SceneDescription, describe_scene
 from helpers import gsplat_like
+from helpers.json_files import read_json, write_json
 from sadgs_ns.formats import write
 from sadgs_ns.formats.gaussians import of_parameters
 from sadgs_ns.render.types import Gaussians
@@ -34,11 +35,13 @@ def test_every_eighth_photo_is_held_out_whatever_its_suffix_in_the_scene(tmp_pat
     assert chain.held_out(photos) == ["00.jpg", "08.jpg", "16.jpg"]
     # The seventeenth did not register, and the ninth was converted.
     names = [f"images/{name}" for name in photos[:16] if name != "08.jpg"] + ["images/08.jpg.png"]
-    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": name} for name in names]}))
-    assert chain.hold_out(tmp_path, chain.held_out(photos)) == 14
-    described = json.loads((tmp_path / "transforms.json").read_text())
+    write_json(tmp_path / "transforms.json", {"frames": [{"file_path": name} for name in names]})
+    actual = chain.hold_out(tmp_path, chain.held_out(photos))
+    assert actual == 14
+    described = read_json(tmp_path / "transforms.json")
     assert set(described["test_filenames"]) == {"images/00.jpg", "images/08.jpg.png"} == set(described["val_filenames"])
-    assert set(described["train_filenames"]) == set(names) - set(described["test_filenames"])
+    actual = set(described["train_filenames"])
+    assert actual == set(names) - set(described["test_filenames"])
 
 
 def row(label: str, seed: int, views: dict[str, list[float]], **fields: Any) -> dict[str, Any]:
@@ -99,7 +102,7 @@ def test_a_gaussian_is_drawn_where_the_photo_s_distorted_camera_sees_it():
     found = np.array([(x * weights).sum(), (y * weights).sum()]) / weights.sum()
     expected = np.asarray(camera.img_from_cam(center[None]))[0]
     assert np.abs(expected - [40 + 60 * 0.5, 30 - 60 * 0.3]).max() > 2, "the lens moves it"
-    np.testing.assert_allclose(found, expected, atol=0.15)
+    assert_allclose(found, expected, atol=0.15)
 
 
 def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> tuple[Path, Path]:
@@ -107,7 +110,7 @@ def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> 
     import pycolmap
 
     photos = folder / "photos"
-    model = folder / "scene" / "work" / "model"
+    model = folder / "scene/work/model"
     photos.mkdir(parents=True)
     model.mkdir(parents=True)
     reconstruction = pycolmap.Reconstruction()
@@ -122,7 +125,7 @@ def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> 
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), view.translation)
         reconstruction.add_image_with_trivial_frame(image, pose)
     reconstruction.write(model)
-    (folder / "scene" / "work" / "settings.json").write_text(json.dumps({"model": "model"}))
+    write_json(folder / "scene/work/settings.json", {"model": "model"})
     return folder / "scene", photos
 
 
@@ -165,7 +168,8 @@ def test_the_score_falls_when_the_photos_are_blurred_before_training(tmp_path: P
         train(scene, images, file)
         splat = chain_score.read_splat(file, torch.device("cpu"))
         scores[name] = chain_score.compare(folder, photos, splat, 1600, names)
-    assert list(scores["sharp"]["views"]) == chain.held_out(names)
+    actual = list(scores["sharp"]["views"])
+    assert actual == chain.held_out(names)
     assert scores["sharp"]["registered"] == VIEWS
     assert scores["sharp"]["missing"] == []
     assert scores["sharp"]["psnr"] > scores["blurred"]["psnr"] + 0.5
@@ -193,7 +197,7 @@ def test_a_chain_that_ends_without_a_row_is_a_failed_one_and_the_others_go_on(
         if measured.capture == "desk":
             return subprocess.Popen(["false"], start_new_session=True)
         identity = {"key": measured.key, "lpips": 0.2, "psnr": 30.0, "ssim": 0.9}
-        (work / "row.json").write_text(json.dumps({**row("new", 0, {"a": [30.0, 0.9, 0.2]}), **identity}))
+        write_json(work / "row.json", {**row("new", 0, {"a": [30.0, 0.9, 0.2]}), **identity})
         return subprocess.Popen(["true"], start_new_session=True)
 
     monkeypatch.setattr(chain, "_start", start)

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.coverage import MAX_POINTS, Views, nearest_angles, thinned
+from helpers.closeness import assert_within
 from helpers.small_scenes import camera
 
 DEPTH = 4.0
@@ -41,7 +42,7 @@ def test_the_angle_is_that_to_the_nearest_training_view_that_shares_points():
     training = looking((20.0, 0.0), (-7.0, 0.0), (90.0, 0.0), (2.0, 50.0))
     angles = nearest_angles(looking((0.0, 0.0), (30.0, 0.0)), training, square())
     expected = torch.tensor([7.0, 10.0])
-    torch.testing.assert_close(angles, expected, atol=0.05, rtol=0)
+    assert_within(angles, expected, 0.05)
     assert nearest_angles(HERE, HERE, square()).item() == 0
     actual = nearest_angles(HERE, looking((180.0, 0.0)), square()).item()
     expected = pytest.approx(180, abs=2)

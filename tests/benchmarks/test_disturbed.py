@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import filecmp
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from numpy.testing import assert_array_equal
 from PIL import Image, ImageDraw
 
 from benchmarks import __main__ as bench
@@ -23,10 +23,11 @@ from benchmarks.photo_captures import photos_of
 from benchmarks.run import build_config
 from benchmarks.validation import SPARSE
 from examples.drawn_scene.scene import write_scene
+from helpers.json_files import read_json
 from sadgs_ns.data.images import NO_MASK
 from sadgs_ns.data.own_parsers import OWN
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 
 
 def write_copy(scene: Path, out: Path, *options: str) -> Path:
@@ -47,7 +48,7 @@ def pixels(path: Path) -> Pixels:
 
 
 def disturbed_photos(copy: Path) -> dict[str, dict[str, Any]]:
-    return json.loads((copy / FILE).read_text())["photos"]
+    return read_json(copy / FILE)["photos"]
 
 
 def names_in_list(copy: Path, split: str) -> list[str]:
@@ -93,7 +94,7 @@ def test_photos_that_are_held_out_are_the_scene_s_byte_by_byte(fold: int, scene:
 def test_photos_that_a_chain_holds_out_are_clean_whatever_the_order_of_the_model(tmp_path: Path):
     from nerfstudio.data.utils import colmap_parsing_utils as colmap
 
-    scene = tmp_path / "scenes" / "turned"
+    scene = tmp_path / "scenes/turned"
     write_scene(scene, 48, 36, 24, 300)
     views = colmap.read_images_binary(scene / SPARSE / "images.bin")
     for index, other in zip(sorted(views), sorted(views, reverse=True), strict=True):
@@ -119,7 +120,8 @@ def test_masks_are_white_exactly_where_a_photo_is_as_it_was(scene: Path, copy: P
     for name, photo in disturbed_photos(copy).items():
         differs = (pixels(scene / "images" / name) != pixels(copy / "disturbed" / name)).any(axis=-1)
         mask = pixels((copy / "true_masks" / name).with_suffix(".png"))
-        np.testing.assert_array_equal(mask, np.where(differs, 0, 255))
+        expected = np.where(differs, 0, 255)
+        assert_array_equal(mask, expected)
         assert 0.03 <= differs.mean() <= 0.15
         assert photo["share"] == pytest.approx(differs.mean(), abs=1e-4)
         assert 1 <= len(photo["things"]) <= 3
@@ -133,7 +135,7 @@ def test_each_photo_has_one_to_three_things_that_cover_3_to_15_percent_of_it():
     for seed in range(60):
         result, covered, names = disturb(photo, things, np.random.default_rng(seed))
         expected = (result != photo).any(axis=-1)
-        np.testing.assert_array_equal(covered, expected)
+        assert_array_equal(covered, expected)
         numbers.add(len(names))
         shares.append(covered.mean())
     assert numbers == {1, 2, 3}
@@ -147,7 +149,8 @@ def test_a_thing_of_the_photo_s_own_colour_still_makes_a_difference(level: int):
     thing = CutOut("plain", np.dstack([np.full((20, 20, 3), level, np.uint8), np.full((20, 20), 255, np.uint8)]))
     result, covered, _ = disturb(photo, [thing], np.random.default_rng(0))
     difference = np.abs(result.astype(int) - photo).sum(axis=-1)
-    np.testing.assert_array_equal(difference, covered.astype(int))
+    expected = covered.astype(int)
+    assert_array_equal(difference, expected)
 
 
 def test_a_thing_keeps_its_colour_and_fades_at_its_edge_alone():
@@ -162,7 +165,7 @@ def test_a_thing_keeps_its_colour_and_fades_at_its_edge_alone():
 
 
 def test_a_photo_into_which_nothing_fits_is_named(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    small = tmp_path / "scenes" / "small"
+    small = tmp_path / "scenes/small"
     (small / "images").mkdir(parents=True)
     (small / "sparse").symlink_to(scene / "sparse")
     for name in names_of(scene):
@@ -200,14 +203,16 @@ def test_a_copy_does_not_depend_on_the_other_scenes_and_replaces_an_earlier_one(
     out = tmp_path / "copies"
     status = bench.main(["disturbed", str(root), str(out), "--seed", "1"])
     assert status == 0
-    assert bench.main(["disturbed", str(root), str(out)]) == 0
+    status = bench.main(["disturbed", str(root), str(out)])
+    assert status == 0
     actual = sorted(path.name for path in out.iterdir())
     expected = sorted(["another", scene.name])
     assert actual == expected
     assert disturbed_photos(out / scene.name) == disturbed_photos(copy) != disturbed_photos(out / "another")
     status = bench.main(["disturbed", str(root), str(tmp_path / "one"), "--only", "another"])
     assert status == 0
-    assert [path.name for path in (tmp_path / "one").iterdir()] == ["another"]
+    names = [path.name for path in (tmp_path / "one").iterdir()]
+    assert names == ["another"]
 
 
 # Cut-outs
@@ -277,8 +282,10 @@ def test_rows_of_the_protocol_read_the_photos_and_masks_that_they_name(
     parser = parser_of(label, copy, tmp_path)
     for split in ("train", "test"):
         outputs = parser.get_dataparser_outputs(split)
-        assert [path.name for path in outputs.image_filenames] == names_in_list(copy, split)
-        assert {path.parent.name for path in outputs.image_filenames} == {folder}
+        names = [path.name for path in outputs.image_filenames]
+        assert names == names_in_list(copy, split)
+        actual = {path.parent.name for path in outputs.image_filenames}
+        assert actual == {folder}
         masked = {path.name for path in outputs.mask_filenames or [] if path != NO_MASK}
         expected = {Path(name).with_suffix(".png").name for name in disturbed_photos(copy)}
         assert masked == (expected if has_masks and split == "train" else set())
@@ -314,7 +321,8 @@ def test_wrong_input_is_one_sentence_and_leaves_all_as_it_was(
         ([root, new, "--only", "kitchen"], "--only names 'kitchen'"),
         ([root, new, "--photos", str(tmp_path)], "cannot be read; give the folder"),
     ):
-        assert bench.main(["disturbed", *arguments]) == 2
+        status = bench.main(["disturbed", *arguments])
+        assert status == 2
         error = capsys.readouterr().err
         assert sentence in error
         assert error.count("\n") == 1

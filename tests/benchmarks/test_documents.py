@@ -73,9 +73,11 @@ def checkout(folder: Path, tables: Any, rows: dict[str, list[dict[str, Any]]], *
 
 def test_runs_are_a_line_each(tmp_path: Path):
     folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
+    actual = (folder / "README.md").read_text("utf8")
     assert (
-        (folder / "README.md").read_text("utf8")
+        actual
         == """# Title
 
 <!-- table: main -->
@@ -95,7 +97,8 @@ After.
 
 def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     folder = checkout(tmp_path, {"sweep": SWEEP}, {"sweep.jsonl": ROWS["sweep.jsonl"]})
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     lines = (folder / "README.md").read_text("utf8").splitlines()[6:10]
     # Castle is the mean of its two scenes; its second setting lacks one of them.
     assert lines[0] == "| × 1 | 30.25 / .9000 / .1000 / 200k | 29.00 / .9000 / .1000 / 200k |"
@@ -106,7 +109,8 @@ def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
 def test_a_difference_that_rests_on_few_runs_is_marked(tmp_path: Path):
     rows = [row("fox", "T1", 0), row("fox", "T1", 1), row("fox", "T2", lpips=0.1 - 1e-9)]
     folder = checkout(tmp_path, {"sweep": {**SWEEP, "scenes": {"fox": ["fox"]}}}, {"sweep.jsonl": rows})
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     assert "| × 2 | .00 / .0000 / .0000 / ×1.00 ¹ |" in (folder / "README.md").read_text("utf8")
 
 
@@ -116,7 +120,8 @@ def test_kernels_and_starts_are_tables_of_their_rows(tmp_path: Path):
     start = {**ok, "label": "sadgs", "first": True, "wait": 9.0, "seconds": 20.0}
     tables = {"kernels": {"kind": "kernels", "rows": "k.jsonl"}, "start": {"kind": "startup", "rows": "s.jsonl"}}
     folder = checkout(tmp_path, tables, {"k.jsonl": [kernel], "s.jsonl": [start]})
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     text = (folder / "README.md").read_text("utf8")
     assert "| adam | torch | 1.250 | 40 |" in text
     assert "| sadgs | 9.0 | 20.0 | – | – |" in text
@@ -133,7 +138,8 @@ def test_changes_are_ranges_over_scenes_and_captures_with_folds_between_texts(tm
     rows = [*ROWS["sweep.jsonl"], row("tree", "T1", lpips=None), row("tree", "T2", psnr=31.0)]
     tables = {"claims": {"kind": "changes", "header": ["Claim", "Paper"], "remark": "Explanation", "lines": lines}}
     folder = checkout(tmp_path, tables, {"sweep.jsonl": rows})
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     actual = (folder / "README.md").read_text("utf8").splitlines()[4:10]
     expected = [
         "| Claim | Paper | PSNR / SSIM / LPIPS / Gaussians | Spread | Scenes × seeds | Explanation |",
@@ -163,19 +169,25 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
         described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": FIGURE}}, sort_keys=False), "utf8"
     )
     path = folder / documents.FIGURES / "peers.png"
-    assert bench.main(["documents", str(folder), "--check"]) == 1
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 1
     assert not path.exists()
-    assert bench.main(["documents", str(folder)]) == 0
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     digest = plots.digest_in(path)
-    assert bench.main(["documents", str(folder), "--check"]) == 0
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 0
     rows = folder / documents.RESULTS / "runs.jsonl"
     rows.write_text(rows.read_text("utf8").replace("250.0", "251.0"), "utf8")
     written = path.read_bytes()
     capsys.readouterr()
-    assert bench.main(["documents", str(folder), "--check"]) == 1
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 1
     assert path.read_bytes() == written
-    assert f"{path} is not what its rows give; run python -m benchmarks documents." in capsys.readouterr().out
-    assert bench.main(["documents", str(folder)]) == 0
+    printed = capsys.readouterr().out
+    assert f"{path} is not what its rows give; run python -m benchmarks documents." in printed
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
     assert path.read_bytes() != written
     assert digest is not None
     assert plots.digest_in(path) not in (digest, None)
@@ -203,7 +215,8 @@ def test_a_figure_that_is_described_wrongly_is_one_sentence(
     described.write_text(
         described.read_text("utf8") + yaml.safe_dump({"figures": {"peers": figure}}, sort_keys=False), "utf8"
     )
-    assert bench.main(["documents", str(folder)]) == 2
+    status = bench.main(["documents", str(folder)])
+    assert status == 2
     error = capsys.readouterr().err
     assert sentence in error
     assert error.count("\n") == 1
@@ -213,18 +226,20 @@ def test_a_figure_that_is_described_wrongly_is_one_sentence(
 
 def test_check_finds_what_changed_and_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS}, {"runs.jsonl": ROWS["runs.jsonl"]})
-    assert bench.main(["documents", str(folder), "--check"]) == 1
-    assert bench.main(["documents", str(folder)]) == 0
-    assert bench.main(["documents", str(folder), "--check"]) == 0
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 1
+    status = bench.main(["documents", str(folder)])
+    assert status == 0
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 0
     capsys.readouterr()
     readme = folder / "README.md"
     wrong = readme.read_text("utf8").replace("29.00", "28.99")
     readme.write_text(wrong, "utf8")
-    assert bench.main(["documents", str(folder), "--check"]) == 1
-    assert (
-        capsys.readouterr().out
-        == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
-    )
+    status = bench.main(["documents", str(folder), "--check"])
+    assert status == 1
+    printed = capsys.readouterr().out
+    assert printed == f"{readme}: table main is not what its rows give; run python -m benchmarks documents.\n"
     assert readme.read_text("utf8") == wrong
 
 
@@ -258,7 +273,8 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
     tables, text, sentence = WRONG[case]
     folder = checkout(tmp_path, tables, {"runs.jsonl": ROWS["runs.jsonl"]}, zulu=text)
     before = (folder / "README.md").read_text("utf8")
-    assert bench.main(["documents", str(folder)]) == 2
+    status = bench.main(["documents", str(folder)])
+    assert status == 2
     error = capsys.readouterr().err
     assert error.startswith("python -m benchmarks documents: ")
     assert sentence in error
@@ -268,18 +284,24 @@ def test_wrong_input_is_one_sentence_and_changes_nothing(case: str, tmp_path: Pa
 
 def test_rows_that_no_table_cites_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS}, ROWS)
-    assert bench.main(["documents", str(folder)]) == 2
-    assert "no table is made of sweep.jsonl" in capsys.readouterr().err
+    status = bench.main(["documents", str(folder)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "no table is made of sweep.jsonl" in errors
 
 
 def test_a_table_that_no_document_holds_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = checkout(tmp_path, {"main": RUNS, "sweep": SWEEP}, ROWS)
     readme = folder / "README.md"
     readme.write_text(readme.read_text("utf8").replace(f"{OPENING.format('sweep')}\n{CLOSING}", ""), "utf8")
-    assert bench.main(["documents", str(folder)]) == 2
-    assert "no document holds sweep" in capsys.readouterr().err
+    status = bench.main(["documents", str(folder)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "no document holds sweep" in errors
 
 
 def test_a_folder_that_is_no_checkout_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert bench.main(["documents", str(tmp_path)]) == 2
-    assert "give a checkout's folder" in capsys.readouterr().err
+    status = bench.main(["documents", str(tmp_path)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "give a checkout's folder" in errors

@@ -16,8 +16,9 @@ from benchmarks import __main__ as bench
 from benchmarks import gate, protocol, side_by_side
 from benchmarks.gate import Metric
 from benchmarks.protocol import Job, Row, Scene
+from helpers.json_files import write_json
 
-CONFIGS = Path(__file__).parents[2] / "configs" / "bench"
+CONFIGS = Path(__file__).parents[2] / "configs/bench"
 BASELINES = sorted(path.stem for path in CONFIGS.glob("baselines/*.json"))
 
 
@@ -38,7 +39,7 @@ def baseline(tmp_path: Path) -> Path:
     path = tmp_path / "baseline.json"
     psnr = entry(30.0, "higher", 0.5)
     count = entry(1000, "near", 50)
-    path.write_text(json.dumps({"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}}))
+    write_json(path, {"fox/ours": {"psnr": psnr, "lpips": entry(0.1, "lower", 0.01), "gaussians": count}})
     return path
 
 
@@ -122,7 +123,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "fox").mkdir()
     scene = {"data": "fox", "dataparser": "nerfstudio-data"}
     content = {"scenes": {"fox": scene}, "seeds": [0], "rows": [{"label": "ours", "method": "sadgs"}]}
-    (tmp_path / "p.yaml").write_text(json.dumps(content))
+    write_json(tmp_path / "p.yaml", content)
     monkeypatch.setattr(side_by_side, "POLL_SECONDS", 0.01)
     started: list[str] = []
 
@@ -131,7 +132,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
         def launch(job: Job, gpu: str | None, folder: Path) -> subprocess.Popen[bytes]:
             started.append(job.key)
-            (folder / "result.json").write_text(json.dumps(result(job, **times, **measured)))
+            write_json(folder / "result.json", result(job, **times, **measured))
             return subprocess.Popen(["true"], start_new_session=True)
 
         monkeypatch.setattr(bench, "launcher", lambda root: launch)
@@ -143,9 +144,12 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_command_exits_with_1_on_a_regression(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
-    assert command("--gate", str(baseline), psnr=29.6) == 0
-    assert f"Gate: passed, 3 metrics of 1 rows in {baseline}." in capsys.readouterr().out
-    assert command("--gate", str(baseline), psnr=29.4) == 1
+    status = command("--gate", str(baseline), psnr=29.6)
+    assert status == 0
+    printed = capsys.readouterr().out
+    assert f"Gate: passed, 3 metrics of 1 rows in {baseline}." in printed
+    status = command("--gate", str(baseline), psnr=29.4)
+    assert status == 1
     said = capsys.readouterr().out
     assert "Gate: fox/ours: psnr moved by -0.6, from 30 to 29.4; tolerance 0.5 (higher is better)." in said
     assert "Gate: FAILED" in said
@@ -153,7 +157,8 @@ def test_the_command_exits_with_1_on_a_regression(command: Any, baseline: Path, 
 
 def test_rows_that_nothing_judges_are_told(command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]):
     baseline.write_text(baseline.read_text().replace("fox/ours", "fox/theirs"))
-    assert command("--gate", str(baseline)) == 1
+    status = command("--gate", str(baseline))
+    assert status == 1
     said = capsys.readouterr().out
     assert "fox/theirs is missing from the results" in said
     assert "fox/ours is not in the baseline" in said
@@ -162,8 +167,10 @@ def test_rows_that_nothing_judges_are_told(command: Any, baseline: Path, capsys:
 def test_a_wrong_baseline_is_told_before_anything_runs(
     command: Any, baseline: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert command("--gate", str(baseline.with_name("no.json"))) == 2
-    assert "no.json is no baseline ([Errno 2] No such file" in capsys.readouterr().err
+    status = command("--gate", str(baseline.with_name("no.json")))
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "no.json is no baseline ([Errno 2] No such file" in errors
     assert not command.started
 
 
@@ -178,5 +185,5 @@ def test_every_baseline_has_the_rows_of_its_protocol(name: str):
 
 
 def test_the_demo_gate_judges_no_times():
-    for metrics in gate.read(CONFIGS / "baselines" / "demo-gate.json").values():
+    for metrics in gate.read(CONFIGS / "baselines/demo-gate.json").values():
         assert set(metrics) == {"psnr", "ssim", "gaussians"}

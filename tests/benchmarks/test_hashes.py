@@ -36,7 +36,8 @@ def test_a_bit_a_name_a_shape_a_type_and_a_missing_tensor_matter():
 
 def test_a_view_has_the_hash_of_its_values():
     transposed = torch.arange(6.0).view(2, 3).T
-    assert hash_tensors({"means": transposed}) == hash_tensors({"means": transposed.clone()})
+    actual = hash_tensors({"means": transposed})
+    assert actual == hash_tensors({"means": transposed.clone()})
 
 
 def test_tensors_are_found_in_nested_values_and_others_are_left_out():
@@ -62,4 +63,5 @@ def test_a_checkpoint_s_plan_and_options_do_not_enter_its_hashes():
     one = hashes_of("old")
     other = hashes_of("new")
     assert one == other
-    assert set(groups_of(checkpoint("old"))["strategy"]) == {"n_total"}
+    actual = set(groups_of(checkpoint("old"))["strategy"])
+    assert actual == {"n_total"}

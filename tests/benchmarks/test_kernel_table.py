@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from benchmarks import __main__ as bench
 from benchmarks import kernel_loops, kernel_share, kernel_table, kernel_twins, results
@@ -18,6 +19,7 @@ from benchmarks.kernel_loops import REFERENCE, Measured, Phase, Rounds, State, p
 from benchmarks.kernel_share import Loop, Part
 from benchmarks.kernel_twins import ALL, TWINS, Twin, replaced
 from benchmarks.protocol import Job, Row, Scene
+from helpers.generators import seeded
 from helpers.gsplat_stub import stub_gsplat
 from helpers.interpreted_rasterizer import use_our_rasterizer
 from helpers.kill_and_resume import differences, set_up
@@ -51,13 +53,14 @@ def test_a_twin_stands_in_a_kernel_s_place_only_meanwhile(name: str):
     with replaced(twin):
         stand_ins = [getattr(module, name) for module, name in places]
     assert stand_ins == [patch.stand_in for patch in twin.patches]
-    assert [getattr(module, name) for module, name in places] == before
+    actual = [getattr(module, name) for module, name in places]
+    assert actual == before
     assert not set(before) & set(stand_ins)
 
 
 def test_adam_s_twin_updates_as_the_kernel():
     adam = pytest.importorskip("sadgs_ns.kernels.adam", reason="Triton is not installed")
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     shapes = [(20, 3), (20, 15, 3), (20, 1)]
     start = [torch.randn((4, *shape), generator=generator).to(DEVICE) for shape in shapes]
     start[1][1, 3] = torch.nan  # A gradient
@@ -73,7 +76,7 @@ def test_adam_s_twin_updates_as_the_kernel():
         assert flag.isnan()
         found.append([*parameters, *means, *squares])
     for ours, theirs in zip(*found, strict=True):
-        torch.testing.assert_close(theirs, ours, rtol=1e-4, atol=1e-6)
+        assert_close(theirs, ours, rtol=1e-4, atol=1e-6)
     assert not torch.equal(found[0][0], start[0][0])
 
 
@@ -184,7 +187,8 @@ def test_what_was_timed_leaves_the_run_as_it_was(trainer: Any):
     state.restore()
     Rounds(trainer, twins, measured).run(PHASES[0], rounds=2, limit=100.0)
     trainer.pipeline.model.step = 3
-    assert differences(before, without_random_numbers(state_of(trainer))) == []
+    actual = differences(before, without_random_numbers(state_of(trainer)))
+    assert actual == []
     for of_twin in measured.values():
         assert of_twin.error == ""
         assert len(of_twin.seconds["densification"]) == 2
@@ -252,17 +256,19 @@ def test_a_row_has_the_loop_relative_to_that_with_all_kernels():
 def test_a_run_with_options_or_on_two_devices_has_no_row_of_its_own_for_all_kernels():
     part = Part(JOB, {REFERENCE: None, "poses": TWINS["poses"]}, {}, is_short=True)
     measured = loop(poses=Measured({"densification": [1.0, 1.0], "after": [0.5, 0.5]}))
-    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
+    labels = [row["label"] for row in kernel_share.rows_of(part, measured)]
+    assert labels == ["poses"]
     part = dataclasses.replace(part, is_short=False)
     assert len(kernel_share.rows_of(part, measured)) == 2
     measured.about["devices"] = 2
-    assert [row["label"] for row in kernel_share.rows_of(part, measured)] == ["poses"]
+    actual = [row["label"] for row in kernel_share.rows_of(part, measured)]
+    assert actual == ["poses"]
 
 
 def test_what_images_take_more_is_added_to_the_steps():
-    part = Part(JOB, {REFERENCE: None}, {"quantization": TWINS["quantization"]}, is_short=False)
+    part = Part(JOB, {REFERENCE: None}, {"structure_tensor": TWINS["structure_tensor"]}, is_short=False)
     measured = loop()
-    measured.images.update({REFERENCE: 0.5, "quantization": 1.0})
+    measured.images.update({REFERENCE: 0.5, "structure_tensor": 1.0})
     row = kernel_share.rows_of(part, measured)[1]
     assert row["ratio"] == pytest.approx(5.5 / 5)
     assert row["images_seconds"] == 1.0
@@ -281,12 +287,13 @@ def test_one_device_measures_all_kernels_but_those_that_send_and_two_only_these(
     assert names == {REFERENCE, "no kernel", *TWINS} - {"exchange"}
     assert optional.is_short
     assert optional.job.row.overrides["pipeline.model.poses"] == "refined"
-    assert {*optional.twins} == {REFERENCE, "poses", "color_matrices"}
+    assert {*optional.twins} == {REFERENCE, "poses"}
     assert len(kernel_share.parts_of(JOB, 1, (), with_options=False)) == 1
     (part,) = kernel_share.parts_of(JOB, 2, (), with_options=True)
     assert [*part.twins] == [REFERENCE, "exchange"]
     assert part.job.row.overrides == {"share_always": True}
-    assert kernel_share.parts_of(JOB, 2, ("tiles",), with_options=True) == []
+    actual = kernel_share.parts_of(JOB, 2, ("tiles",), with_options=True)
+    assert actual == []
     (part,) = kernel_share.parts_of(JOB, 1, ("tiles",), with_options=True)
     assert [*part.twins] == [REFERENCE, "tiles"]
 
@@ -297,14 +304,14 @@ def test_the_table_has_a_line_for_each_kernel_and_columns_for_each_scene():
         ok
         | {"scene": "bonsai", "label": "adam", "ratio": 1.25, "low": 1.2, "high": 1.3, "launches": 41.4}
         | {"launches_with_kernel": 30.0},
-        ok | {"scene": "bonsai", "label": "quantization", "ratio": 1.002},
+        ok | {"scene": "bonsai", "label": "structure_tensor", "ratio": 1.002},
         {"status": "failed", "by": "torch", "scene": "site", "label": "adam", "error": "no"},
     ]
     assert kernel_table.markdown(rows).splitlines() == [
         "| Kernel | In its place | bonsai: loop | launches a step | site: loop | launches a step |",
         "| --- | --- | ---: | ---: | ---: | ---: |",
         "| adam | torch | 1.250 (1.200 to 1.300) | 41 / 30 | failed | – |",
-        "| quantization | torch | 1.002 | – | – | – |",
+        "| structure_tensor | torch | 1.002 | – | – | – |",
     ]
 
 
@@ -330,10 +337,12 @@ def test_the_command_writes_a_row_for_each_kernel(
     (tmp_path / "scene").symlink_to(scene)
     output = tmp_path / "kernels.jsonl"
     words = ["kernels", str(tmp_path / "mine.yaml"), "--scenes", str(tmp_path), "--output", str(output)]
-    words += ["--only", "demo", "--rounds", "1", "--kernels", "adam", "poses", "quantization"]
-    assert bench.main(words) == 0, capsys.readouterr().err
+    words += ["--only", "demo", "--rounds", "1", "--kernels", "adam", "poses", "structure_tensor"]
+    status = bench.main(words)
+    assert status == 0, capsys.readouterr().err
     rows = results.read(output)
-    assert [row["label"] for row in rows] == [REFERENCE, "adam", "quantization", "poses"]
+    labels = [row["label"] for row in rows]
+    assert labels == [REFERENCE, "adam", "structure_tensor", "poses"]
     for row in rows:
         assert row["status"] == "ok"
         assert row["ratio"] > 0
@@ -341,7 +350,8 @@ def test_the_command_writes_a_row_for_each_kernel(
     assert rows[1]["replayed"] == {"densification": 0, "after": 0}
     assert {*rows[1]["ms"]} == {"densification", "after"}
     assert {*rows[3]["ms"]} == {"densification"}
-    assert "| poses | torch |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| poses | torch |" in printed
 
 
 @pytest.mark.parametrize(
@@ -357,6 +367,8 @@ def test_unknown_names_are_refused_in_a_sentence(
     monkeypatch.chdir(tmp_path)
     Path("mine.yaml").write_text(PROTOCOL)
     given = ["kernels", "mine.yaml", "--scenes", ".", "--output", "rows.jsonl", *words]
-    assert bench.main(given) == 2
-    assert f"python -m benchmarks kernels: {sentence}" in capsys.readouterr().err
+    status = bench.main(given)
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert f"python -m benchmarks kernels: {sentence}" in errors
     assert not Path("rows.jsonl").exists()

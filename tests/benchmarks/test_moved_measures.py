@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 from PIL import Image
 
 from benchmarks import __main__ as bench
@@ -47,7 +48,7 @@ def columns(start: int, stop: int) -> torch.Tensor:
 
 
 def test_overlap_and_what_is_left_out_wrongly_are_those_of_regions_and_true_masks(tmp_path: Path):
-    photos = [write_truth(tmp_path, "0.jpg"), tmp_path / "disturbed" / "1.jpg", write_truth(tmp_path, "2.jpg")]
+    photos = [write_truth(tmp_path, "0.jpg"), tmp_path / "disturbed/1.jpg", write_truth(tmp_path, "2.jpg")]
     measured = moved.measures(pipeline_of(photos, {0: columns(0, 45), 1: columns(0, 6)}))
     assert measured["moved_iou"] == pytest.approx((30 / 45 + 0) / 2)
     assert measured["moved_share"] == pytest.approx((45 + 6) / 180)
@@ -56,14 +57,16 @@ def test_overlap_and_what_is_left_out_wrongly_are_those_of_regions_and_true_mask
 
 def test_all_that_is_found_in_the_scene_s_own_photos_is_wrong(tmp_path: Path):
     write_truth(tmp_path, "0.jpg")
-    measured = moved.measures(pipeline_of([tmp_path / "images" / "0.jpg"], {0: columns(0, 6)}))
+    measured = moved.measures(pipeline_of([tmp_path / "images/0.jpg"], {0: columns(0, 6)}))
     assert measured["moved_iou"] is None
     assert measured["moved_share"] == measured["moved_wrong"] == pytest.approx(0.1)
 
 
 def test_a_run_that_was_not_to_find_anything_has_no_such_fields(tmp_path: Path):
-    assert moved.measures(pipeline_of([tmp_path / "images" / "0.jpg"], {}, finds=False)) == {}
-    assert moved.measures(SimpleNamespace(config=SimpleNamespace())) == {}
+    actual = moved.measures(pipeline_of([tmp_path / "images/0.jpg"], {}, finds=False))
+    assert actual == {}
+    actual = moved.measures(SimpleNamespace(config=SimpleNamespace()))
+    assert actual == {}
 
 
 def result(label: str, **fields: float) -> Result:
@@ -86,12 +89,16 @@ def test_evidence_of_a_run_is_drawn(scene: Path, tmp_path: Path, capsys: pytest.
     trainer.setup()
     trainer.train()
     arguments = ["evidence", str(trainer.base_dir / "config.yml"), "--output", str(tmp_path / "evidence")]
-    assert bench.main([*arguments, "--only", "001,003"]) == 0
+    status = bench.main([*arguments, "--only", "001,003"])
+    assert status == 0
     drawn = sorted((tmp_path / "evidence").iterdir())
-    assert [path.name for path in drawn] == ["001.png", "003.png"]
-    with Image.open(drawn[0]) as picture, Image.open(scene / "images" / "001.png") as photo:
+    names = [path.name for path in drawn]
+    assert names == ["001.png", "003.png"]
+    with Image.open(drawn[0]) as picture, Image.open(scene / "images/001.png") as photo:
         assert picture.size == (3 * photo.width, 2 * photo.height)
         corner = picture.convert("RGB").crop((0, 0, photo.width, photo.height))
-        np.testing.assert_array_equal(np.asarray(corner), np.asarray(photo.convert("RGB")))
+        actual = np.asarray(corner)
+        expected = np.asarray(photo.convert("RGB"))
+        assert_array_equal(actual, expected)
     output = capsys.readouterr().out
     assert "deviation" in output and "001.png: 0.0% found" in output

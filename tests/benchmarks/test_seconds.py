@@ -79,7 +79,8 @@ def test_the_picture_has_a_bar_for_each_part_that_is_not_too_short():
         bars.append((corners.x0, corners.width))
     assert name == "fox-new"
     assert bars == [(1.0, 3.0), (1.5, 1.5)]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["sadgs: cameras", "COLMAP: features"]
+    actual = [label.get_text() for label in axes.get_yticklabels()]
+    assert actual == ["sadgs: cameras", "COLMAP: features"]
 
 
 def test_the_protocol_names_three_captures_of_which_one_is_thinned():
@@ -108,11 +109,12 @@ def test_the_parts_of_a_command_are_measured_once(tmp_path: Path, capsys: pytest
     assert {name for process, name in names if process == "COLMAP"} >= {"imports", "features", "placing"}
     for _, _, begin, end in measured["parts"]:
         assert 0 <= begin <= end <= measured["seconds"]
-    assert (tmp_path / "plots" / "corner-new.png").exists()
+    assert (tmp_path / "plots/corner-new.png").exists()
     written = (tmp_path / "rows.jsonl").read_bytes()
     assert measure() == 0  # There is nothing left to do.
     assert (tmp_path / "rows.jsonl").read_bytes() == written
-    assert "| corner | new | COLMAP | features |" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| corner | new | COLMAP | features |" in printed
 
 
 def test_a_command_that_fails_has_a_row_and_its_output_a_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -40,7 +40,8 @@ def test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones(
     (tmp_path / "room").mkdir()
     output = tmp_path / "rows.jsonl"
     given = ["startup", "--data", str(tmp_path / "room"), "--output", str(output), "--later", "1", "--iterations", "9"]
-    assert bench.main(given) == 0
+    status = bench.main(given)
+    assert status == 0
     rows = results.read(output)
     actual = [(row["label"], row["first"]) for row in rows]
     expected = [(way, first) for first in (True, False) for way in WAYS]
@@ -55,14 +56,16 @@ def test_each_way_has_a_first_run_with_caches_of_its_own_and_later_ones(
     assert started[0]["cache"] not in caches
     for run in started:
         assert "--max-num-iterations 9" in " ".join(run["words"])
-    assert "| sadgs without compile_ahead | " in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "| sadgs without compile_ahead | " in printed
 
 
 def test_a_run_that_fails_has_a_row_that_says_so(started: list[dict[str, Any]], tmp_path: Path):
     (tmp_path / "fails").mkdir()
     output = tmp_path / "rows.jsonl"
     given = ["startup", "--data", str(tmp_path / "fails"), "--output", str(output), "--ways", "sadgs", "--later", "0"]
-    assert bench.main(given) == 1
+    status = bench.main(given)
+    assert status == 1
     (row,) = results.read(output)
     assert row["status"] == "failed"
     assert row["error"].startswith("CalledProcessError")
@@ -79,8 +82,10 @@ def test_wrong_names_are_refused_in_a_sentence(
     words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
-    assert bench.main(["startup", "--output", "rows.jsonl", *words]) == 2
-    assert f"python -m benchmarks startup: {sentence}" in capsys.readouterr().err
+    status = bench.main(["startup", "--output", "rows.jsonl", *words])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert f"python -m benchmarks startup: {sentence}" in errors
     assert list(tmp_path.iterdir()) == []
 
 

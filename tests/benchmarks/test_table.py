@@ -47,7 +47,7 @@ def test_the_command_prints_the_table_and_draws_a_plot(tmp_path: Path, capsys: p
     assert "| fox | a | 20.0, 21.0 | 0.102 | – | 30.00, 31.00 | – | – |" in printed
     assert "| _hidden |" in printed
     assert "- south & west, broken, seed 0 failed: RuntimeError: out of <memory>.\n" in printed
-    with Image.open(tmp_path / "out" / "quality-time.png") as image:
+    with Image.open(tmp_path / "out/quality-time.png") as image:
         assert image.format == "PNG"
         assert image.width == round(7.2 * 200)
 
@@ -122,9 +122,11 @@ def test_single_views_of_all_folds_are_in_the_median_and_in_the_worst():
 
 def test_the_printed_table_pools_the_seeds_of_all_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rows = [result(scene, seed=seed) for scene in ("fox", "south") for seed in (0, 1)]
-    assert bench.main(["table", write_lines(tmp_path / "r.jsonl", rows)]) == 0
+    status = bench.main(["table", write_lines(tmp_path / "r.jsonl", rows)])
+    assert status == 0
     told = "- ours: pooled standard deviation .71 / .0000 / .0000 of PSNR, SSIM and LPIPS over 2 scenes.\n"
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
 
 
 def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -133,8 +135,10 @@ def test_old_results_without_new_fields(tmp_path: Path, capsys: pytest.CaptureFi
     least = {name: bare[name] for name in ("key", "scene", "label", "seed", "status")}
     for rows in ([result(lpips=None, gpu=None, peak_gb=None), bare], [least]):
         lines = write_lines(tmp_path / "r.jsonl", rows)
-        assert bench.main(["table", lines, "--plots", str(tmp_path / "out")]) == 0
-        assert "| bare | " in capsys.readouterr().out
+        status = bench.main(["table", lines, "--plots", str(tmp_path / "out")])
+        assert status == 0
+        printed = capsys.readouterr().out
+        assert "| bare | " in printed
 
 
 @pytest.mark.parametrize(

@@ -31,9 +31,11 @@ OURS = [row("ours", 0, [27.1, 21.0], **NAMED), row("ours", 1, [27.11, 17.5], **N
 def test_spread_worst_view_and_losses_of_each_label(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     fold = [row("ours", 0, [25.0], "fox-2"), row("ours", 1, [21.0], "fox-2")]
     files = [write(tmp_path / "1.jsonl", *BASE), write(tmp_path / "2.jsonl", *OURS, *fold)]
-    assert bench.main(["views", *files]) == 0
+    status = bench.main(["views", *files])
+    assert status == 0
+    printed = capsys.readouterr().out
     assert (
-        capsys.readouterr().out
+        printed
         == """## fox
 
 | View | Angle ° | base | ours |
@@ -73,7 +75,8 @@ def test_frozen_references_alone_count_and_may_be_older(tmp_path: Path, capsys: 
 
 def test_runs_without_views_are_skipped_and_older_ones_number_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rows = [row("ours", 0, [1.0, 1.0]), row("ours", 0, [26.0, 20.0]), row("ours", 1, None), row("base", 0, None)]
-    assert bench.main(["views", write(tmp_path / "r.jsonl", *rows)]) == 0
+    status = bench.main(["views", write(tmp_path / "r.jsonl", *rows)])
+    assert status == 0
     out, error = capsys.readouterr()
     assert "| 0 | – | 26.00 |\n| 1 | – | 20.00 |\n" in out
     assert "base" not in out
@@ -93,7 +96,8 @@ def test_wrong_files_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
         ([good, others], different),
         ([good, "--references", fewer], different),
     ):
-        assert bench.main(["views", *arguments]) == 2
+        status = bench.main(["views", *arguments])
+        assert status == 2
         told = capsys.readouterr().err
         assert told.startswith("python -m benchmarks views: ")
         assert told.endswith(f"{sentence}\n")

@@ -116,13 +116,17 @@ def test_a_run_is_told_from_a_capture(given: str, tmp_path: Path, capsys: pytest
     run = tmp_path / "a run"
     (run / "nerfstudio_models").mkdir(parents=True)
     (run / "config.yml").touch()
-    assert doctor.main([str(run / given)]) == 1
-    assert "is a run" not in capsys.readouterr().out
-    (run / "nerfstudio_models" / "step-000000007.ckpt").touch()
-    assert doctor.main([str(run / given)]) == 1
+    status = doctor.main([str(run / given)])
+    assert status == 1
+    printed = capsys.readouterr().out
+    assert "is a run" not in printed
+    (run / "nerfstudio_models/step-000000007.ckpt").touch()
+    status = doctor.main([str(run / given)])
+    assert status == 1
     config = f"'{run}/config.yml'"
     shown = f"`ns-viewer --load-config {config}` shows it, and `sadgs-export {config} --output splat.ply` exports it."
-    assert capsys.readouterr().out.splitlines()[-1] == f"error: {run / given} is a run and no capture: {shown}"
+    printed = capsys.readouterr().out
+    assert printed.splitlines()[-1] == f"error: {run / given} is a run and no capture: {shown}"
 
 
 @pytest.mark.parametrize(("severity", "code"), [("note", 0), ("warning", 0), ("error", 1)])
@@ -130,8 +134,10 @@ def test_only_an_error_makes_the_exit_code_1(
     severity: Any, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(doctor, "check_machine", lambda: iter([Finding(severity, "Something is so.")]))
-    assert doctor.main([]) == code
-    assert f"{severity}: Something is so." in capsys.readouterr().out.splitlines()
+    status = doctor.main([])
+    assert status == code
+    printed = capsys.readouterr().out
+    assert f"{severity}: Something is so." in printed.splitlines()
 
 
 def test_a_missing_package_is_called_missing(monkeypatch: pytest.MonkeyPatch):
@@ -232,7 +238,8 @@ def test_a_gpu_that_torch_was_not_built_for_is_an_error(
     sm = "sm_{}{}".format(*capability)
     told = f"This torch has code for {', '.join(architectures)}, but none for this GPU, {sm}: install {remedy}"
     assert errors == ([told] if remedy else [])
-    assert any("kernels here" in sentence for sentence in machine()) == (remedy is None)  # else not even tried
+    actual = any("kernels here" in sentence for sentence in machine())
+    assert actual == (remedy is None)  # else not even tried
 
 
 def test_kernels_that_do_not_compile_say_why(cuda: SimpleNamespace):
@@ -305,7 +312,7 @@ def test_what_the_system_has_is_named(nothing: Path, tmp_path: Path, monkeypatch
     for name in ("clang", "ffmpeg", "nvcc"):
         (nothing / name).touch(0o755)
     (tmp_path / "include").mkdir()
-    (tmp_path / "include" / "Python.h").touch()
+    (tmp_path / "include/Python.h").touch()
     put_node_into_path(tmp_path / "node.js", "", "", monkeypatch)
     monkeypatch.setattr(programs, "LIBUSB", "libc.so.6")  # It is everywhere.
     assert about("C compiler: ") == ("note", f"C compiler: {nothing}/clang.")

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
 from helpers.kill_and_resume import parser_of
 from helpers.short_runs import TRAIN_VIEWS, configure, train
 from sadgs_ns.cli import export
@@ -43,9 +45,10 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     file = tmp_path / "cameras.json"
     status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
     assert status == 0
-    assert f"{file}: {TRAIN_VIEWS} training cameras, refined" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{file}: {TRAIN_VIEWS} training cameras, refined" in printed
     expected = refined_poses(trainer)
-    torch.testing.assert_close(written_poses(file), expected, rtol=0, atol=2e-6)
+    assert_within(written_poses(file), expected, 2e-6)
     initial = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
     assert float((expected - initial).abs().max()) > 1e-4
     content = json.loads(file.read_text("utf8"))
@@ -54,23 +57,25 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     assert actual == [str(path) for path in files]
 
     arguments = ["--output", str(tmp_path / "splat.ply"), "--cameras", str(file), "--frame", "colmap"]
-    assert export.main([str(run), *arguments]) == 0
+    status = export.main([str(run), *arguments])
+    assert status == 0
     to_run = from_data(run.with_name("dataparser_transforms.json"))
     back = torch.from_numpy(to_run.poses(written_poses(file).double().numpy())).float()
-    torch.testing.assert_close(back, expected, rtol=0, atol=5e-6)
+    assert_within(back, expected, 5e-6)
 
 
 def test_training_on_the_written_cameras_begins_where_the_run_ended(scene: Path, tmp_path: Path):
     run, trainer = run_of(scene, tmp_path, "refined")
-    file = tmp_path / "again" / "transforms.json"
+    file = tmp_path / "again/transforms.json"
     status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
     assert status == 0
     parser = NerfstudioDataParserConfig(data=file, eval_mode="all", downscale_factor=1)
     parser._target = OWN.get(parser._target, parser._target)
     outputs = parser.setup().get_dataparser_outputs("train")
-    torch.testing.assert_close(outputs.cameras.camera_to_worlds, refined_poses(trainer), rtol=0, atol=2e-6)
+    assert_within(outputs.cameras.camera_to_worlds, refined_poses(trainer), 2e-6)
     before = trainer.pipeline.datamanager.train_dataset.cameras
-    torch.testing.assert_close(outputs.cameras.get_intrinsics_matrices(), before.get_intrinsics_matrices())
+    actual = outputs.cameras.get_intrinsics_matrices()
+    assert_close(actual, before.get_intrinsics_matrices())
 
 
 def test_cameras_of_a_run_with_fixed_poses_are_those_of_the_capture(
@@ -80,9 +85,10 @@ def test_cameras_of_a_run_with_fixed_poses_are_those_of_the_capture(
     file = tmp_path / "cameras.json"
     status = export.main([str(run), "--output", str(tmp_path / "splat.ply"), "--cameras", str(file)])
     assert status == 0
-    assert f"{file}: {TRAIN_VIEWS} training cameras, as the capture has them" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{file}: {TRAIN_VIEWS} training cameras, as the capture has them" in printed
     initial = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds
-    torch.testing.assert_close(written_poses(file), initial, rtol=0, atol=2e-6)
+    assert_within(written_poses(file), initial, 2e-6)
 
 
 def test_a_capture_of_other_images_and_another_kind_of_file_are_refused(
@@ -92,7 +98,8 @@ def test_a_capture_of_other_images_and_another_kind_of_file_are_refused(
     splat = tmp_path / "splat.ply"
     status = export.main([str(run), "--output", str(splat), "--cameras", "cameras.txt"])
     assert status == 2
-    assert "--cameras cameras.txt is for a file that ends in .json: name one." in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "--cameras cameras.txt is for a file that ends in .json: name one." in errors
     checkpoint = trainer.checkpoint_dir / "step-000000003.ckpt"
     state = torch.load(checkpoint, weights_only=True)
     state["pipeline"]["_extra_state"]["images"] = ["a.png", "b.png"]

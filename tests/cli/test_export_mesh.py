@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import sys
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.testing import assert_allclose
 from plyfile import PlyData
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 from examples.drawn_scene.drawing import Sphere
 from examples.drawn_scene.scene import room_surfaces, write_scene
 from helpers.drawn_surfaces import nearest
+from helpers.json_files import write_json
+from helpers.refusals import refusal
 from sadgs_ns.cli import export, meshing
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.data.run_cameras import read_cameras
-from sadgs_ns.errors import InputError
 from sadgs_ns.formats import mesh
 from sadgs_ns.formats.gaussians import DEGREE_0
 from sadgs_ns.render.types import RenderOptions
@@ -75,7 +76,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     torch.save(state, folder / "run/nerfstudio_models/step-000000007.ckpt")
     transform = np.c_[MOVED.orthogonal, MOVED.translation / MOVED.scale]
     noted = {"transform": transform.tolist(), "scale": MOVED.scale}
-    (folder / "run/dataparser_transforms.json").write_text(json.dumps(noted))
+    write_json(folder / "run/dataparser_transforms.json", noted)
     (folder / "run/config.yml").write_text("!!python/object/apply:os.abort []")  # nobody may execute it
     return folder / "scene", folder / "run"
 
@@ -92,10 +93,12 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
     size = ["--voxel-size", str(voxel * MOVED.scale)]
     for frame in ("colmap", "nerfstudio"):
         path = tmp_path / f"{frame}.mesh.ply"
-        assert command(run, path, *size, "--frame", frame) == 0
+        status = command(run, path, *size, "--frame", frame)
+        assert status == 0
         found = PlyData.read(str(path))
         said = rf"{path}: {found['face'].count:,} triangles fused from rendered depth, .* in the frame of {frame}\n"
-        assert re.fullmatch(said, capsys.readouterr().out)
+        printed = capsys.readouterr().out
+        assert re.fullmatch(said, printed)
     paths = (tmp_path / f"{frame}.mesh.ply" for frame in ("colmap", "nerfstudio"))
     in_room, in_run = (trimesh.load(path, process=False) for path in paths)
     assert isinstance(in_room, trimesh.Trimesh)
@@ -114,7 +117,8 @@ def test_the_mesh_lies_on_the_room_s_surfaces_in_both_frames(
         colors = in_room.visual.vertex_colors[in_room.faces[on, 0], :3] / 255  # type: ignore[union-attr]
         errors = np.abs(ROOM[index].colour(in_room.vertices[in_room.faces[on, 0]]) - colors)
         assert np.median(errors) < 0.15
-    assert {path.name for path in tmp_path.iterdir()} == {"colmap.mesh.ply", "nerfstudio.mesh.ply"}
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"colmap.mesh.ply", "nerfstudio.mesh.ply"}
 
 
 @pytest.mark.usefixtures("open3d")
@@ -133,7 +137,7 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
     assert mesh.Fusion(larger).has_room_for(views)
     assert not mesh.Fusion(larger / 2**0.5).has_room_for(views)
     monkeypatch.setattr(mesh, "MOST_VOXELS", 16**3)
-    with pytest.raises(InputError, match=r"^A mesh of voxels of 0\.02 does not fit in memory: .*--voxel-size 0\.04\.$"):
+    with refusal(r"^A mesh of voxels of 0\.02 does not fit in memory: .*--voxel-size 0\.04\.$"):
         meshing.write_mesh(tmp_path / "b.mesh.ply", params, cameras, voxel_size=0.02)
 
 
@@ -141,10 +145,12 @@ def test_without_a_size_voxels_are_two_pixels_wide_or_as_many_as_fit(
 def test_what_is_cleaned_away_is_not_in_the_mesh(run: tuple[Path, Path], tmp_path: Path):
     whole = tmp_path / "whole.mesh.ply"
     cut = tmp_path / "cut.mesh.ply"
-    assert command(run, whole) == 0
+    status = command(run, whole)
+    assert status == 0
     vertices = trimesh.load(whole, process=False).vertices  # type: ignore[union-attr]
     middle = float(np.median(vertices[:, 0]))
-    assert command(run, cut, "--crop", f"{middle}", "-9", "-9", "9", "9", "9") == 0
+    status = command(run, cut, "--crop", f"{middle}", "-9", "-9", "9", "9", "9")
+    assert status == 0
     left = trimesh.load(cut, process=False).vertices  # type: ignore[union-attr]
     assert len(left) > 100
     assert left[:, 0].min() > middle - 3 * SPACING * MOVED.scale
@@ -171,7 +177,7 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
     assert ((view.depth[16] > 0) == (alpha * np.exp(-0.5 * 0.25 / 36.3) >= 0.5)).all()
     actual = view.color[16, 16]
     expected = [0.9, 0.5, 0.1]
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
+    assert_allclose(actual, expected, atol=1e-5)
 
 
 @pytest.mark.hard_case(
@@ -191,8 +197,10 @@ def test_depth_is_along_the_axis_and_pixels_that_are_mostly_empty_are_left_out()
 def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
     run: tuple[Path, Path], options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert command(run, tmp_path / "a.mesh.ply", *options.split()) == 2
-    assert re.fullmatch(f"sadgs-export: {sentence}\n", capsys.readouterr().err)
+    status = command(run, tmp_path / "a.mesh.ply", *options.split())
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert re.fullmatch(f"sadgs-export: {sentence}\n", errors)
     assert not list(tmp_path.iterdir())
 
 
@@ -201,10 +209,10 @@ def test_what_gives_no_mesh_is_one_sentence_and_leaves_nothing(
 def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Path, Path], tmp_path: Path):
     params, _ = export.read_checkpoint(run[1])
     nowhere = meshing.RunCameras(torch.zeros(0, 3, 4), torch.zeros(0, 3, 3), [])
-    with pytest.raises(InputError, match=r"^The capture has no training views to fuse .* give another with --data\.$"):
+    with refusal(r"^The capture has no training views to fuse .* give another with --data\.$"):
         meshing.write_mesh(tmp_path / "a.mesh.ply", params, nowhere)
     params["opacities"] = torch.full_like(params["opacities"], -6.0)
-    with pytest.raises(InputError, match=r"^The training views see no surface that is half opaque: train longer, or "):
+    with refusal(r"^The training views see no surface that is half opaque: train longer, or "):
         meshing.write_mesh(tmp_path / "a.mesh.ply", params, read_cameras(run[1], run[0]))
     assert not list(tmp_path.iterdir())
 
@@ -213,14 +221,18 @@ def test_no_views_and_gaussians_that_are_all_faint_have_no_surface(run: tuple[Pa
 def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     run: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
-    assert command(run, tmp_path / "a.ply", "--voxel-size", "0.1") == 2
+    status = command(run, tmp_path / "a.ply", "--voxel-size", "0.1")
+    assert status == 2
     said = "sadgs-export: --voxel-size is for meshes: let --output end in .mesh.ply, or leave it out.\n"
-    assert capsys.readouterr().err == said
+    errors = capsys.readouterr().err
+    assert errors == said
     monkeypatch.setitem(sys.modules, "open3d", None)  # Importing it fails.
-    assert command(run, tmp_path / "a.mesh.ply") == 2
+    status = command(run, tmp_path / "a.mesh.ply")
+    assert status == 2
     remedy = "install open3d and libusb-package with pip"
     said = rf"sadgs-export: A mesh is made by open3d, which cannot be imported \(.*\): {remedy}\.\n"
-    assert re.fullmatch(said, capsys.readouterr().err)
+    errors = capsys.readouterr().err
+    assert re.fullmatch(said, errors)
     assert not list(tmp_path.iterdir())
 
 

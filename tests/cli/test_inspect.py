@@ -21,12 +21,13 @@ from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
+from torch.testing import assert_close
 
 from examples.drawn_scene.scene import write_scene
 from helpers.kill_and_resume import configure, set_up
+from helpers.refusals import refusal
 from helpers.short_runs import in_the_viewer
 from sadgs_ns.cli import inspect, inspection
-from sadgs_ns.errors import InputError
 from sadgs_ns.method.growth import structure_aware
 from sadgs_ns.method.quantization import INVALID
 from sadgs_ns.method.strategy import StructureAwareStrategy
@@ -90,7 +91,8 @@ def test_all_pictures_of_a_finished_run_are_written(run: Path, tmp_path: Path, c
     status = inspect.main([str(run), "--view", "1", "--output", str(tmp_path / "new")])
     assert status == 0
     names = [f"train-001-{name}.png" for name in ("ellipses", "wavelength", "eta", "children", "low", "step")]
-    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == sorted(names)
+    actual = sorted(path.name for path in (tmp_path / "new").iterdir())
+    assert actual == sorted(names)
     printed = capsys.readouterr().out
     assert f"after {ITERATIONS} iterations" in printed
     assert f"{TRAIN_VIEWS} training views" in printed
@@ -123,7 +125,8 @@ def test_held_out_views_and_earlier_checkpoints_can_be_asked_for(run: Path, tmp_
 
 
 def wrong(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    assert inspect.main(arguments) == 2
+    status = inspect.main(arguments)
+    assert status == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     return lines[0]
@@ -163,10 +166,11 @@ def test_a_run_and_its_capture_may_have_moved(
     config.pipeline.datamanager.data = config.pipeline.datamanager.dataparser.data = Path(
         "scene"
     )  # as trained elsewhere
-    (tmp_path / "moved" / "config.yml").write_text(yaml.dump(config))
+    (tmp_path / "moved/config.yml").write_text(yaml.dump(config))
     monkeypatch.chdir(tmp_path)
     assert "scene does not exist: give --data" in wrong(["moved"], capsys)
-    assert inspect.main(["moved", "--data", str(scene)]) == 0
+    status = inspect.main(["moved", "--data", str(scene)])
+    assert status == 0
     assert len(list(Path("moved/inspect").iterdir())) == 6
 
 
@@ -174,7 +178,7 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     shutil.copytree(run.parent, tmp_path / "run")
-    folder = tmp_path / "run" / "nerfstudio_models"
+    folder = tmp_path / "run/nerfstudio_models"
     latest = max(folder.iterdir())
     state = torch.load(latest, weights_only=True)
     means = state["pipeline"].pop("_model.gauss_params.means")
@@ -195,7 +199,7 @@ def test_checkpoints_that_cannot_be_used_are_named_with_options_that_there_are(
     torch.save(state, latest)
     config = yaml.load(run.read_text(), Loader=yaml.Loader)
     config.pipeline.model.poses = "refined"
-    (tmp_path / "run" / "config.yml").write_text(yaml.dump(config))
+    (tmp_path / "run/config.yml").write_text(yaml.dump(config))
     line = wrong([str(tmp_path / "run")], capsys)
     assert f"{latest} does not fit its run: The checkpoint's _model.poses.table" in line
     assert line.endswith(remedy)
@@ -248,7 +252,8 @@ def test_observing_leaves_the_run_as_it_was(early: SadgsPipeline):
     before = early.state_dict()["_model.gauss_params.means"].clone()
     random = torch.get_rng_state()
     first = observe_training_views(early.structure_cache)
-    torch.testing.assert_close(observe_training_views(early.structure_cache), first)
+    actual = observe_training_views(early.structure_cache)
+    assert_close(actual, first)
     inspection.screen_gradients(early, iter)
     assert torch.equal(torch.get_rng_state(), random)
     assert torch.equal(early.model.means, before)
@@ -266,7 +271,7 @@ def test_the_structure_step_makes_the_children_of_the_plan(early: SadgsPipeline)
     whole = step["origins"][torch.bincount(step["origins"])[step["origins"]] == 1]
     actual = step["means"][: len(whole)]
     expected = model.means.detach()[whole]
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
 
 
 def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
@@ -276,7 +281,8 @@ def test_the_conventional_step_clones_or_splits_in_two(early: SadgsPipeline):
     assert float(gradients["absgrad2d"].max()) > float(gradients["grad2d"].max()) > 0
     step = inspection.conventional_step(model, gradients)
     sizes = torch.bincount(step["origins"], minlength=model.num_points)
-    assert set(sizes.unique().tolist()) == {1, 2}
+    actual = set(sizes.unique().tolist())
+    assert actual == {1, 2}
     assert len(step["means"]) == len(step["origins"]) > model.num_points
     assert torch.equal(inspection.conventional_step(model, gradients)["means"], step["means"])
 
@@ -293,7 +299,8 @@ def test_the_photo_and_its_camera_belong_together(early: SadgsPipeline):
         x, y = (pixels[:, :2] / pixels[:, 2:]).floor().long().unbind(-1)
         inside = (pixels[:, 2] > 0) & (x >= 0) & (x < WIDTH) & (y >= 0) & (y < HEIGHT)
         errors = [(other.photo[y[inside], x[inside]] - colors[inside]).abs().mean() for other in views]
-        assert int(torch.stack(errors).argmin()) == number
+        actual = int(torch.stack(errors).argmin())
+        assert actual == number
         assert int(inside.sum()) > 30
 
 
@@ -307,7 +314,8 @@ def a_camera(pipeline: SadgsPipeline, index: int = 0) -> Cameras:
 @pytest.mark.filterwarnings("ignore:This property will be removed:DeprecationWarning")  # of torchmetrics, not ours
 def test_the_viewer_finds_the_elements_in_their_order(panel: StructurePanel):
     found = [path for path, _ in parse_object(pipeline_of(panel), ViewerElement, "Custom Elements")]
-    assert [path.removeprefix("Custom Elements/structure/") for path in found if "/structure/" in path] == [
+    actual = [path.removeprefix("Custom Elements/structure/") for path in found if "/structure/" in path]
+    assert actual == [
         "choice", "legend", "observe", "set_max_gaussians", "set_tau_split", "table",
     ]  # fmt: skip
 
@@ -396,8 +404,9 @@ def test_the_viewer_is_told_of_a_camera_that_is_no_pinhole_and_goes_on(choice: s
     for _ in range(2):
         outputs = in_the_viewer(lambda: pipeline.model.get_outputs_for_camera(camera))
         assert outputs[OUTPUT].shape == outputs["rgb"].shape == (HEIGHT, WIDTH, 3)
-    assert capsys.readouterr().out.count("EQUIRECTANGULAR") == 1
-    with pytest.raises(InputError, match="EQUIRECTANGULAR"):  # ns-render
+    printed = capsys.readouterr().out
+    assert printed.count("EQUIRECTANGULAR") == 1
+    with refusal("EQUIRECTANGULAR"):  # ns-render
         pipeline.model.get_outputs_for_camera(camera)
 
 
@@ -477,7 +486,8 @@ def test_values_out_of_range_are_refused_and_put_back(name: str, values: list[An
 
 def test_counts_of_the_structure_steps_are_kept_in_checkpoints_and_told(run: Path, panel: StructurePanel):
     steps: list[dict[str, int]] = pipeline_of(panel).model.strategy_state["structure_steps"]  # type: ignore[assignment]
-    assert [step["iteration"] for step in steps] == [10, 20, 30]
+    actual = [step["iteration"] for step in steps]
+    assert actual == [10, 20, 30]
     for step in steps:
         assert step["split"] <= step["violating"] <= step["before"]
         assert step["low"] <= step["before"]
@@ -511,8 +521,10 @@ def test_the_nearest_view_is_near_and_looks_the_same_way():
     far[:, 3] = 5.0
     near = here.clone()
     near[0, 3] = 0.3
-    assert nearest_view(torch.stack([behind, far, near]), here, extent=1.0) == 2
-    assert nearest_view(torch.stack([behind, far]), here, extent=100.0) == 1
+    actual = nearest_view(torch.stack([behind, far, near]), here, extent=1.0)
+    assert actual == 2
+    actual = nearest_view(torch.stack([behind, far]), here, extent=100.0)
+    assert actual == 1
 
 
 def test_what_the_panel_draws_of_a_training_view_is_what_the_command_draws(panel: StructurePanel):

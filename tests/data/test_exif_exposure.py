@@ -22,9 +22,11 @@ def photo(path: Path, tags: Mapping[Any, float]) -> Path:
 
 
 def test_shutter_aperture_and_iso_make_stops(tmp_path: Path):
-    assert exposure_stops(photo(tmp_path / "a.jpg", TAGS)) == pytest.approx(0.0)  # 200 / 50 / 2²
+    actual = exposure_stops(photo(tmp_path / "a.jpg", TAGS))
+    assert actual == pytest.approx(0.0)  # 200 / 50 / 2²
     longer = photo(tmp_path / "b.jpg", TAGS | {ExifTags.Base.ExposureTime: 1 / 25})
-    assert exposures_of([tmp_path / "a.jpg", longer]) == pytest.approx([0.0, 1.0])
+    actual = exposures_of([tmp_path / "a.jpg", longer])
+    assert actual == pytest.approx([0.0, 1.0])
 
 
 @pytest.mark.hard_case("EXIF data without shutter, aperture or ISO, or with zeros", "tells no exposure")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import unicodedata
@@ -14,6 +13,7 @@ import pytest
 from PIL import Image
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.json_files import read_json, write_json
 from helpers.short_runs import blender_data, nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
@@ -115,10 +115,10 @@ def test_images_of_a_blender_scene_are_looked_for_too(tmp_path: Path):
 def test_a_list_of_images_names_the_one_that_is_meant(tmp_path: Path):
     nerfstudio_data(tmp_path)
     path = tmp_path / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     names = [frame["file_path"] for frame in meta["frames"]]
     lists = {"train_filenames": ["000.PNG", *names[1:]], "val_filenames": [], "test_filenames": []}
-    path.write_text(json.dumps(meta | lists))
+    write_json(path, meta | lists)
     (said,) = errors(check_data(tmp_path))
     assert said.endswith(f"names '000.PNG', which is no image with a pose: {names[0]!r} may be meant; correct it.")
 
@@ -177,9 +177,9 @@ def test_copies_of_equal_names_are_refused(tmp_path: Path):
     nerfstudio_data(tmp_path)
     shutil.copytree(tmp_path / "images", tmp_path / "images_2")
     path = tmp_path / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     meta["frames"][1]["file_path"] = "other/000.png"
-    path.write_text(json.dumps(meta))
+    write_json(path, meta)
     (said,) = errors(check_nerfstudio(tmp_path, ParserOptions(downscale_factor=2)))
     assert "images_2/000.png would be the copy of both images/000.png and other/000.png, whose folders" in said
 
@@ -189,6 +189,8 @@ def test_files_of_others_and_of_another_kind_are_not_meant(tmp_path: Path):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
     missing = tmp_path / "images/b/0.png"
-    assert NearbyFiles(tmp_path).find(missing) == [tmp_path / "images/a/0.png"]
+    actual = NearbyFiles(tmp_path).find(missing)
+    assert actual == [tmp_path / "images/a/0.png"]
     assert NearbyFiles(tmp_path, [tmp_path / "images/a/0.png"]).sentence(missing) is None
-    assert NearbyFiles(tmp_path).find(tmp_path / "masks/b/0.JPG") == [tmp_path / "masks/0.png"]
+    actual = NearbyFiles(tmp_path).find(tmp_path / "masks/b/0.JPG")
+    assert actual == [tmp_path / "masks/0.png"]

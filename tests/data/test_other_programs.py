@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 import re
 import shlex
@@ -19,8 +18,10 @@ import tyro
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from torch.testing import assert_close
 
 from helpers import forked_python
+from helpers.json_files import read_json, write_json
 from helpers.short_runs import blender_data, nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.data.checks import check_data
@@ -58,11 +59,11 @@ def write(captures: Path, tmp_path: Path) -> Callable[..., Path]:
     ) -> Path:
         data = Path(shutil.copytree(captures / (kind or "transforms"), tmp_path / "data"))
         for path in data.glob("transforms*.json"):
-            meta = json.loads(path.read_text())
+            meta = read_json(path)
             of_file(meta)
             for frame in meta["frames"]:
                 of_frame(frame)
-            path.write_text(json.dumps(meta))
+            write_json(path, meta)
         return data
 
     return change
@@ -86,8 +87,8 @@ def expect_the_same_cameras(data: Path, original: Path) -> None:
     assert errors(data) == []
     found = read_cameras(data / "no run", data)
     expected = read_cameras(data / "no run", original)
-    torch.testing.assert_close(found.camera_to_worlds, expected.camera_to_worlds)
-    torch.testing.assert_close(found.Ks, expected.Ks, rtol=1e-5, atol=1e-4)
+    assert_close(found.camera_to_worlds, expected.camera_to_worlds)
+    assert_close(found.Ks, expected.Ks, rtol=1e-5, atol=1e-4)
     assert found.sizes == expected.sizes
     assert files == {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
 
@@ -132,7 +133,7 @@ def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
     data = write(lambda m: m.update(k1=0.5, p1=0.1), lambda f: f.update(k1=0.01, k2=0.02))
     actual = parsed(data).distortion_params
     expected = torch.tensor([0.01, 0.02, 0, 0, 0, 0]).expand(9, 6)
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     shutil.rmtree(data)
     data = write(lambda m: m.update(is_fisheye=True, k1=0.01))
     assert errors(data) == []
@@ -153,12 +154,12 @@ def test_lenses_and_models_of_frames_count(write: Callable[..., Path]):
 def test_names_of_masks_are_mended_as_those_of_images(name: str, write: Callable[..., Path]):
     data = write(of_frame=lambda frame: frame.update(mask_path=name))
     (data / "masks").mkdir()
-    Image.new("L", (WIDTH, HEIGHT), 255).save(data / "masks" / "0.png")
+    Image.new("L", (WIDTH, HEIGHT), 255).save(data / "masks/0.png")
     (told,) = [finding.sentence for finding in check_data(data) if finding.sentence.endswith(" masks.")]
     assert re.search(r" with (\d+) masks\.$", told)
     config = NerfstudioDataParserConfig(data=data)
     config._target = TransformsParser
-    assert {*config.setup().get_dataparser_outputs().mask_filenames} == {data / "masks" / "0.png"}
+    assert {*config.setup().get_dataparser_outputs().mask_filenames} == {data / "masks/0.png"}
 
 
 @pytest.mark.hard_case(
@@ -192,7 +193,8 @@ def test_a_scene_that_moves_is_told(kind: str, file: str, write: Callable[..., P
     assert warning.startswith(f"{data}/{file} gives each frame a time, as of a scene that moves, and ")
     shutil.rmtree(data)
     data = write(of_frame=lambda frame: frame.update(time=0.5), kind=kind)
-    assert [finding for finding in check_data(data) if finding.severity == "warning"] == []
+    actual = [finding for finding in check_data(data) if finding.severity == "warning"]
+    assert actual == []
 
 
 @pytest.mark.hard_case(
@@ -232,8 +234,9 @@ def test_what_is_not_read_of_a_blender_scene_is_read_of_a_transforms_json(write:
     assert errors(data) == []
     cameras = parsed(data)
     expected = torch.full_like(cameras.fx, FOCAL)
-    torch.testing.assert_close(cameras.fx, expected)
-    assert set(cameras.cx.flatten().tolist()) == {20.0}
+    assert_close(cameras.fx, expected)
+    actual = set(cameras.cx.flatten().tolist())
+    assert actual == {20.0}
     assert (cameras.distortion_params[:, 0] > 0).all()
 
 
@@ -341,7 +344,7 @@ def test_a_capture_of_polycam_without_depth_is_converted_with_its_poses(tmp_path
     for name in ("keyframes/images/1.jpg", "keyframes/cameras/1.json"):
         (data / name).parent.mkdir(parents=True)
     Image.new("RGB", (100, 80)).save(data / "keyframes/images/1.jpg")
-    (data / "keyframes/cameras/1.json").write_text(json.dumps(pose | camera))
+    write_json(data / "keyframes/cameras/1.json", pose | camera)
     (said,) = errors(data)
     converting = f"ns-process-data polycam --data '{data}' --output-dir FOLDER"
     making = f"mkdir '{data}'/keyframes/depth"
@@ -359,7 +362,7 @@ ProcessPolycam(data=Path({str(data)!r}), output_dir=Path({str(tmp_path / "out")!
     assert "Depth map directory" in forked_python.python(code).stderr
     subprocess.run(making, shell=True, check=True)
     assert forked_python.python(code).returncode == 0
-    (frame,) = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    (frame,) = read_json(tmp_path / "out/transforms.json")["frames"]
     assert frame["fl_x"] == 90
     assert errors(data) == [f"{data}/keyframes/cameras/1.json has poses: `{converting}` keeps them."]
 
@@ -367,7 +370,7 @@ ProcessPolycam(data=Path({str(data)!r}), output_dir=Path({str(tmp_path / "out")!
 @pytest.mark.hard_case("poses of LLFF (`poses_bounds.npy`) or in a `capture.json`", "the file is named: it is not read")
 @pytest.mark.parametrize("name", ["poses_bounds.npy", "capture.json"])
 def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path, tmp_path: Path):
-    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    shutil.copytree(captures / "transforms/images", tmp_path / "images")
     (tmp_path / name).touch()
     computing = f"`sadgs-process {tmp_path}/images FOLDER` computes others"
     problem = f"{tmp_path / name} may have poses, but in a format that is not read"
@@ -400,7 +403,7 @@ def test_poses_in_a_format_that_is_not_read_are_named(name: str, captures: Path,
 def test_the_command_that_makes_a_colmap_model_of_other_poses_is_named(
     file: str, content: str, command: str, captures: Path, tmp_path: Path
 ):
-    shutil.copytree(captures / "transforms" / "images", tmp_path / "images")
+    shutil.copytree(captures / "transforms/images", tmp_path / "images")
     (tmp_path / file).write_text("")
     assert poses_elsewhere(tmp_path) is None
     (tmp_path / file).write_text(content)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.data.utils import colmap_parsing_utils
 from PIL import Image
 
+from helpers.json_files import read_json, write_json
 from helpers.short_runs import blender_data, nerfstudio_data
 from sadgs_ns.data.own_parsers import BlenderParser, ColmapParser
 from sadgs_ns.data.transforms_parser import TransformsParser
@@ -107,9 +107,9 @@ def test_a_transforms_json_becomes_what_nerfstudio_makes_of_it(
     for path in (tmp_path / "images").iterdir():
         with Image.open(path) as image:
             image.resize((image.width // 2, image.height // 2)).save(tmp_path / "images_2" / path.name)
-    meta = json.loads((tmp_path / "transforms.json").read_text())
+    meta = read_json(tmp_path / "transforms.json")
     change(meta)
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    write_json(tmp_path / "transforms.json", meta)
     for data in (tmp_path, tmp_path / "transforms.json"):
         config = NerfstudioDataParserConfig(data=data, **options)
         found = TransformsParser(config).get_dataparser_outputs(split)
@@ -142,9 +142,9 @@ def test_a_file_that_was_not_checked_is_refused_as_by_nerfstudio(
 ):
     config = nerfstudio_data(tmp_path)
     config.load_3D_points = False
-    meta = json.loads((tmp_path / "transforms.json").read_text())
+    meta = read_json(tmp_path / "transforms.json")
     change(meta)
-    (tmp_path / "transforms.json").write_text(json.dumps(meta))
+    write_json(tmp_path / "transforms.json", meta)
     with pytest.raises(error, match=sentence):
         TransformsParser(config).get_dataparser_outputs(split)
     with pytest.raises((error, AssertionError), match=sentence):

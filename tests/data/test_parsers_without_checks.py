@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from nerfstudio.data.dataparsers.dnerf_dataparser import DNeRFDataParserConfig
 from nerfstudio.data.dataparsers.nerfosr_dataparser import NeRFOSRDataParserConfig
 from PIL import Image
 
+from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import blender_data, configure, frames, is_finite, train
 from helpers.small_scenes import HEIGHT, WIDTH
@@ -35,7 +35,7 @@ OTHERS = {name: parser for name, parser in all_dataparsers.items() if type(parse
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_folder_that_a_parser_cannot_read_is_refused_before_a_run_begins(name: str, tmp_path: Path):
     (tmp_path / "data").mkdir()
-    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "data" / "a.png")
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "data/a.png")
     parser: Any = copy.deepcopy(OTHERS[name])
     parser.data = tmp_path / "data"
     config = configure(tmp_path / "out", parser)
@@ -52,10 +52,10 @@ def moving_scene(folder: Path, times: list[float]) -> None:
     """Write a scene as D-NeRF has them."""
     blender_data(folder, "white")
     for path in folder.glob("transforms_*.json"):
-        content = json.loads(path.read_text())
+        content = read_json(path)
         for frame, time in zip(content["frames"], 5 * times, strict=False):
             frame["time"] = time
-        path.write_text(json.dumps(content))
+        write_json(path, content)
 
 
 @pytest.mark.hard_case("`dnerf-data`, whose frames have a `time`", "trains as one moment, with a warning")
@@ -72,7 +72,7 @@ def test_a_scene_that_moves_is_told_of_other_parsers_too(times: list[float], num
 
 @pytest.mark.hard_case("`nerfosr-data`, whose parser names files by texts", "trains")
 def test_names_of_files_may_be_texts(tmp_path: Path):
-    scene = tmp_path / "data" / "stjacob" / "final"
+    scene = tmp_path / "data/stjacob/final"
     described = frames(tmp_path / "drawn", [(WIDTH, HEIGHT)])
     for index, frame in enumerate(described):
         split = scene / ["validation", "test", "train"][min(index // 2, 2)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 from PIL import Image
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
+from helpers.json_files import read_json, write_json
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.colmap import check_colmap
 from sadgs_ns.data.layouts import ParserOptions
@@ -33,7 +33,7 @@ def as_transforms(data: Path) -> None:
         intrinsics = {"fl_x": camera.focal_length_x, "fl_y": camera.focal_length_y, "w": camera.width}
         intrinsics |= {"cx": camera.principal_point_x, "cy": camera.principal_point_y, "h": camera.height}
         frames.append({"file_path": f"images/{image.name}", "transform_matrix": pose.tolist(), **intrinsics})
-    (data / "transforms.json").write_text(json.dumps({"frames": frames, "ply_file_path": "points.ply"}))
+    write_json(data / "transforms.json", {"frames": frames, "ply_file_path": "points.ply"})
 
 
 @pytest.fixture(params=["colmap", "transforms"])
@@ -135,7 +135,8 @@ def test_damaged_photos_are_told_of_alone(capture: Callable[..., Path]):
 def test_photos_stay_closed_where_they_need_not_exist(capture: Callable[..., Path]):
     options = ParserOptions(colmap_path=SPARSE_FOLDER)
     findings = check_colmap(capture(change=swap), options, open_images=False)
-    assert [finding for finding in findings if finding.severity != "note"] == []
+    actual = [finding for finding in findings if finding.severity != "note"]
+    assert actual == []
 
 
 @pytest.mark.parametrize("layout", ["transforms"], indirect=True)
@@ -143,7 +144,7 @@ def test_photos_stay_closed_where_they_need_not_exist(capture: Callable[..., Pat
 def test_points_are_projected_as_a_lens_distorts(is_told: bool, capture: Callable[..., Path]):
     data = capture()
     path = data / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     for frame in meta["frames"]:
         K = np.array([[frame["fl_x"], 0, frame["cx"]], [0, frame["fl_y"], frame["cy"]], [0, 0, 1]])
         pixels = np.stack(np.meshgrid(np.arange(96), np.arange(72)), -1).reshape(-1, 1, 2) + 0.5
@@ -151,5 +152,5 @@ def test_points_are_projected_as_a_lens_distorts(is_told: bool, capture: Callabl
         x, y = straight.transpose(2, 0, 1).astype(np.float32).copy()
         photo = cv2.imread(str(data / frame["file_path"]))
         cv2.imwrite(str(data / frame["file_path"]), cv2.remap(photo, x, y, cv2.INTER_LINEAR))
-    path.write_text(json.dumps(meta | {"k1": -K1 if is_told else K1}))
+    write_json(path, meta | {"k1": -K1 if is_told else K1})
     assert len(remarks(data)) == is_told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from sadgs_ns.data.colmap_views import _rotations
@@ -11,4 +12,4 @@ from sadgs_ns.data.colmap_views import _rotations
 def test_quaternions_become_the_matrices_that_scipy_makes_of_them():
     quats = np.random.default_rng(0).normal(size=(50, 4))  # wxyz, not of unit length
     expected = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(_rotations(quats), expected, atol=1e-12)
+    assert_allclose(_rotations(quats), expected, atol=1e-12)

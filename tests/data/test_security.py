@@ -8,7 +8,6 @@ Pillow and plyfile parse images and PLY files.
 from __future__ import annotations
 
 import asyncio
-import json
 import socket
 import sys
 from contextlib import closing
@@ -35,6 +34,7 @@ from benchmarks import protocol, run
 from benchmarks.protocol import Row, Scene
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers.forked_python import HANGS
+from helpers.json_files import write_json
 from helpers.kill_and_resume import set_up
 from sadgs_ns.training import presets
 from sadgs_ns.training.config import SadgsDatamanagerConfig, SadgsTrainerConfig
@@ -189,7 +189,7 @@ def transforms(folder: Path, names: list[str]) -> NerfstudioDataParserConfig:
         pose[0, 3] = index
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
     meta = {"fl_x": 8, "fl_y": 8, "cx": 4, "cy": 4, "w": 8, "h": 8, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(meta))
+    write_json(folder / "transforms.json", meta)
     return NerfstudioDataParserConfig(data=folder, downscale_factor=1, eval_mode="all")
 
 

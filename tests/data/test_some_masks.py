@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import shutil
 from pathlib import Path
@@ -14,12 +13,13 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import set_up
+from helpers.refusals import refusal
 from helpers.short_runs import configure, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.capture import check_capture
-from sadgs_ns.errors import InputError
 from sadgs_ns.training.config import SadgsDatamanagerConfig
 
 
@@ -51,11 +51,11 @@ def json_data(data: Path) -> DataParserConfig:
     """A transforms.json of which two frames have masks."""
     parser = nerfstudio_data(data)
     path = data / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     for frame in meta["frames"][2:4]:
         frame["mask_path"] = frame["file_path"].replace("images", "masks")
         write_mask(data / frame["mask_path"])
-    path.write_text(json.dumps(meta))
+    write_json(path, meta)
     parser.eval_mode = "all"
     return parser
 
@@ -83,7 +83,8 @@ def test_nothing_is_hidden_in_images_without_mask(layout: str, scene: Path, tmp_
         mask = manager.train_dataset.get_data(index)["mask"]
         expected = manager.train_dataset.get_data(index)["image"].shape[:2]
         assert mask.shape[:2] == expected
-        assert int((~mask.bool()).sum()) == number
+        actual = int((~mask.bool()).sum())
+        assert actual == number
 
 
 def test_the_options_that_the_doctor_advises_are_taken(scene: Path, tmp_path: Path):
@@ -105,21 +106,19 @@ def test_a_mask_that_is_nearly_there_is_named(name: str, scene: Path, tmp_path: 
     parser = colmap_data(scene, tmp_path / "data")
     mask = tmp_path / "data/masks" / name
     write_mask(mask)
-    with pytest.raises(
-        InputError, match=rf"/masks/004\.png does not exist, but {mask} does: correct the name, or save"
-    ):
+    with refusal(rf"/masks/004\.png does not exist, but {mask} does: correct the name, or save"):
         check_capture(SadgsDatamanagerConfig(dataparser=parser))
 
 
 def test_a_folder_without_any_mask_is_refused(scene: Path, tmp_path: Path):
     parser = colmap_data(scene, tmp_path / "data")
     shutil.rmtree(tmp_path / "data/masks")
-    with pytest.raises(InputError, match=r"/masks has no mask of any image, such as \S+/000\.png: put masks there, or"):
+    with refusal(r"/masks has no mask of any image, such as \S+/000\.png: put masks there, or"):
         check_capture(SadgsDatamanagerConfig(dataparser=parser))
 
 
 def test_a_mask_that_a_frame_names_must_be_there(tmp_path: Path):
     parser = json_data(tmp_path / "data")
     (tmp_path / "data/masks/002.png").unlink()
-    with pytest.raises(InputError, match=r"/masks/002\.png does not exist: put it there"):
+    with refusal(r"/masks/002\.png does not exist: put it there"):
         check_capture(SadgsDatamanagerConfig(dataparser=parser))

@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 import torch
 import torch.distributed as dist
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
 from helpers.sharded_rendering import GAUSSIANS, inputs, splats, weights
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
@@ -52,7 +54,7 @@ def compare_with_one(world: World, views: int) -> None:
         assert band is not None
         image = torch.cat([colors, alphas], dim=-1)[0, band.first - band.top : band.last - band.top]
         rows = slice(band.first, band.last)
-        torch.testing.assert_close(image, expected[band.view, rows], atol=1e-5, rtol=0)
+        assert_within(image, expected[band.view, rows], 1e-5)
         loss = loss + (image * weight[band.view, rows]).sum()
     loss.backward()
     seen = visible(own)
@@ -61,11 +63,11 @@ def compare_with_one(world: World, views: int) -> None:
         whole = getattr(info["means2d"], name)[:, part]
         scale = float(whole[seen].abs().max())
         actual = getattr(own["means2d"], name)[seen]
-        torch.testing.assert_close(actual, whole[seen], atol=1e-3 * scale, rtol=1e-2)
+        assert_close(actual, whole[seen], atol=1e-3 * scale, rtol=1e-2)
     for name, leaf in mine.items():
         gradient = alone[name].grad
         assert gradient is not None
-        torch.testing.assert_close(leaf.grad, gradient[part], atol=1e-3 * float(gradient.abs().max()), rtol=1e-2)
+        assert_close(leaf.grad, gradient[part], atol=1e-3 * float(gradient.abs().max()), rtol=1e-2)
 
 
 @GPUS

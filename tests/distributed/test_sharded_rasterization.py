@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within, assert_within_share
 from helpers.gloo_ranks import run_ranks
 from helpers.sharded_rendering import GAUSSIANS, HEIGHT, inputs, splats, weights
 from sadgs_ns.distributed.bands import ROWS, share_rows, views_of_rank
@@ -80,11 +82,11 @@ def test_processes_draw_and_differentiate_what_one_does(
     for result in results:
         for band, image in result["images"]:
             covered[band.view, band.first : band.last] += 1
-            torch.testing.assert_close(image, expected[band.view, band.first : band.last], atol=1e-5, rtol=0)
+            assert_within(image, expected[band.view, band.first : band.last], 1e-5)
         assert result["flags"] == (1 << ranks) - 1
     assert (covered == 1).all()
     actual = sum(result["loss"] for result in results)
-    torch.testing.assert_close(actual, loss.detach(), rtol=1e-5, atol=0)
+    assert_within_share(actual, loss.detach(), 1e-5)
 
     def together(name: str, dim: int) -> Tensor:
         return torch.cat([result[name] for result in results], dim=dim)
@@ -95,11 +97,11 @@ def test_processes_draw_and_differentiate_what_one_does(
     for name, tensor in (("grad2d", info["means2d"].grad), ("absgrad", info["means2d"].absgrad)):
         scale = float(tensor[seen].abs().max())
         actual = together(name, 1)[seen]
-        torch.testing.assert_close(actual, tensor[seen], atol=1e-5 * scale, rtol=1e-4)
+        assert_close(actual, tensor[seen], atol=1e-5 * scale, rtol=1e-4)
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         gradient = torch.cat([result["gradients"][name] for result in results])
-        torch.testing.assert_close(gradient, leaf.grad, atol=1e-5 * float(leaf.grad.abs().max()), rtol=1e-4)
+        assert_close(gradient, leaf.grad, atol=1e-5 * float(leaf.grad.abs().max()), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("views", "height", "ranks"), [(4, 100, 2), (1, 33, 3), (3, 75, 2), (2, 10, 3), (5, 64, 3)])

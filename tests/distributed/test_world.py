@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from helpers.generators import seeded
 from helpers.gloo_ranks import run_ranks
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
@@ -20,7 +21,7 @@ BUDGETS = (0, 1, 5, 37, 120, 2000, float("inf"), -3)
 
 def growths() -> list[tuple[torch.Tensor, torch.Tensor]]:
     """Growth and priorities of 90 Gaussians: with ties, with infinities and zeros, and with one that outgrows all."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     growth = torch.randint(0, 9, (90,), generator=generator)
     ties = torch.randint(0, 6, (90,), generator=generator).float()
     spread = torch.exp(20 * torch.randn(90, generator=generator))
@@ -52,7 +53,8 @@ def test_a_world_of_one_process_asks_nobody():
     assert world.take_even_part(5) == slice(0, 5)
     assert world.total == 5
     assert world.sum(values) is values
-    assert world.sums(3, 4) == [3, 4]
+    actual = world.sums(3, 4)
+    assert actual == [3, 4]
     assert world.gather(values).tolist() == [[3, 4]]
     assert values.data_ptr() == world.gather(values).data_ptr()
     world.broadcast(values, 0)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from plyfile import PlyData
 
@@ -27,6 +28,7 @@ from examples.drawn_scene.scene import (
     room_surfaces,
     write_scene,
 )
+from helpers.generators import seeded
 from sadgs_ns.cli.export import write_gaussians
 from sadgs_ns.files import atomic_path
 
@@ -80,14 +82,14 @@ def test_seed_moves_only_the_points() -> None:
     assert first.wavelengths == second.wavelengths
     actual = first.views[3].rotation
     expected = second.views[3].rotation
-    np.testing.assert_array_equal(actual, expected)
+    assert_array_equal(actual, expected)
 
 
 def test_poses_are_rotations() -> None:
     for view in arc_views(VIEWS, WIDTH, HEIGHT):
         actual = view.rotation @ view.rotation.T
         expected = np.eye(3)
-        np.testing.assert_allclose(actual, expected, atol=1e-12)
+        assert_allclose(actual, expected, atol=1e-12)
         assert np.linalg.det(view.rotation) == pytest.approx(1)
         assert view.rotation[1, 2] < 0  # the image's down is the world's down
 
@@ -97,8 +99,8 @@ def test_rays_and_projection_agree() -> None:
     pixels, depth = view.project(view.position + 1.7 * view.rays())
     columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     expected = np.stack([columns.ravel(), rows.ravel()], -1)
-    np.testing.assert_allclose(pixels, expected, atol=1e-9)
-    np.testing.assert_allclose(depth, 1.7)
+    assert_allclose(pixels, expected, atol=1e-9)
+    assert_allclose(depth, 1.7)
 
 
 def test_points_project_onto_their_colours() -> None:
@@ -140,7 +142,8 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     ).setup()
     train = parser.get_dataparser_outputs("train")
     held_out = parser.get_dataparser_outputs("val")
-    assert [path.name for path in held_out.image_filenames] == ["000.png", "008.png"]
+    names = [path.name for path in held_out.image_filenames]
+    assert names == ["000.png", "008.png"]
     assert len(train.image_filenames) == VIEWS - 2
     with Image.open(train.image_filenames[0]) as image:
         assert image.size == (WIDTH, HEIGHT)
@@ -153,23 +156,24 @@ def test_nerfstudio_reads_the_scene(written: tuple[Path, SceneDescription]) -> N
     local = (points - pose[:, 3]) @ pose[:, :3] * torch.tensor([1.0, -1.0, -1.0])  # OpenGL → OpenCV
     pixels = view.focal * local[:, :2] / local[:, 2:] + torch.tensor([WIDTH / 2, HEIGHT / 2])
     expected = view.project(scene.points)[0]
-    np.testing.assert_allclose(pixels.numpy(), expected, atol=1e-2)
+    assert_allclose(pixels.numpy(), expected, atol=1e-2)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7])
 def test_wavelength_of_a_fronto_parallel_wall(angle: float) -> None:
     expected = 0.2 * 100.0 / 2.0  # wavelength · focal / depth, whatever the direction
     actual = expected_wavelength_map([wall(angle=angle)], camera())
-    np.testing.assert_allclose(actual, expected, rtol=1e-5)
+    assert_allclose(actual, expected, rtol=1e-5)
 
 
 def test_checker_wavelength_is_its_fundamental() -> None:
     checker = wall(texture="checker", wavelength=0.4)
     actual = expected_wavelength_map([checker], camera())
-    np.testing.assert_allclose(actual, 0.4 * 100.0 / 2.0, rtol=1e-5)
+    assert_allclose(actual, 0.4 * 100.0 / 2.0, rtol=1e-5)
     row = render([checker], camera(), 1)[0, :, 0]
     changes = np.flatnonzero(np.diff(row.astype(int)))
-    np.testing.assert_allclose(np.diff(changes).mean(), 20.0 / np.sqrt(2.0), atol=1.0)  # a square's side
+    expected = 20.0 / np.sqrt(2.0)
+    assert_allclose(np.diff(changes).mean(), expected, atol=1.0)  # a square's side
 
 
 def test_wavelength_is_foreshortened_along_the_grating_only() -> None:
@@ -212,9 +216,12 @@ def test_foreign_folders_are_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
         write_scene(tmp_path, WIDTH, HEIGHT, VIEWS)
     with pytest.raises(FileExistsError, match="is a file"):
         write_scene(tmp_path / "thesis.tex", WIDTH, HEIGHT, VIEWS)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-    assert demo_scene.main([str(tmp_path)]) == 2
-    assert capsys.readouterr().err.startswith("error: ")
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["thesis.tex"]
+    status = demo_scene.main([str(tmp_path)])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith("error: ")
 
 
 def test_an_earlier_scene_is_replaced_and_a_failed_one_leaves_nothing(
@@ -231,12 +238,13 @@ def test_an_earlier_scene_is_replaced_and_a_failed_one_leaves_nothing(
     monkeypatch.setattr(demo_scene, "_write_colmap", fail)
     with pytest.raises(OSError, match="no space left"):
         write_scene(folder, 16, 16, 12, points=10)
-    assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == ["scene"]
     assert len(list((folder / "images").iterdir())) == 9
 
 
 def gaussians(count: int, bands: int) -> dict[str, Any]:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     shapes: dict[str, tuple[int, ...]] = {
         "means": (3,),
         "scales": (3,),
@@ -251,7 +259,7 @@ def gaussians(count: int, bands: int) -> dict[str, Any]:
 @pytest.mark.parametrize("bands", [0, 15])
 def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     params = gaussians(7, bands)
-    path = tmp_path / "new folder" / "splat.ply"
+    path = tmp_path / "new folder/splat.ply"
     assert write_gaussians(path, params) == 7
     vertex = PlyData.read(str(path))["vertex"]
     columns = [p.name for p in vertex.properties]
@@ -264,16 +272,16 @@ def test_ply_round_trip(tmp_path: Path, bands: int) -> None:
     def read(*names: str) -> np.ndarray:
         return np.stack([vertex[name] for name in names], -1)
 
-    np.testing.assert_array_equal(read("x", "y", "z"), params["means"])
-    np.testing.assert_array_equal(read("opacity"), params["opacities"])
-    np.testing.assert_array_equal(read("scale_0", "scale_1", "scale_2"), params["scales"])
+    assert_array_equal(read("x", "y", "z"), params["means"])
+    assert_array_equal(read("opacity"), params["opacities"])
+    assert_array_equal(read("scale_0", "scale_1", "scale_2"), params["scales"])
     rotations = torch.nn.functional.normalize(params["quats"], dim=-1)
     actual = read("rot_0", "rot_1", "rot_2", "rot_3")
-    np.testing.assert_allclose(actual, rotations, rtol=1e-6)
+    assert_allclose(actual, rotations, rtol=1e-6)
     for band in range(bands):
         names = [f"f_rest_{colour * bands + band}" for colour in range(3)]
         expected = params["features_rest"][:, band]
-        np.testing.assert_array_equal(read(*names), expected)
+        assert_array_equal(read(*names), expected)
 
 
 def test_ply_drops_what_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -281,10 +289,11 @@ def test_ply_drops_what_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixt
     params["means"][1, 0] = torch.nan
     params["features_rest"][3, 2, 1] = torch.inf
     assert write_gaussians(tmp_path / "splat.ply", params) == 3
-    assert "dropped 2 of 5 Gaussians" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "dropped 2 of 5 Gaussians" in printed
     actual = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]["x"]
     expected = params["means"][[0, 2, 4], 0]
-    np.testing.assert_array_equal(actual, expected)
+    assert_array_equal(actual, expected)
 
 
 def test_ply_names_the_tensor_of_another_shape(tmp_path: Path) -> None:
@@ -309,6 +318,8 @@ def test_demo_refuses_too_few_iterations(tmp_path: Path, capsys: pytest.CaptureF
     with quiet_import():
         from examples.drawn_scene.__main__ import main
 
-    assert main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"]) == 2
-    assert capsys.readouterr().err == "error: --max-num-iterations is 3; give at least 30, or nothing is split\n"
+    status = main(["--output", str(tmp_path / "out"), "--max-num-iterations", "3"])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert errors == "error: --max-num-iterations is 3; give at least 30, or nothing is split\n"
     assert not (tmp_path / "out").exists()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from numpy.testing import assert_allclose
 from PIL import Image
 
 from examples import gallery_page, turn
@@ -24,8 +25,10 @@ TARGET = np.array([0.5, 1.0, 0.3])
 def test_the_camera_looks_at_the_point_from_the_same_distance_all_along_and_ends_where_it_began():
     poses = turn.ellipse(POSE, TARGET, math.radians(25), math.radians(8), frames=16)
     towards = TARGET - poses[:, :, 3]
-    np.testing.assert_allclose(np.linalg.norm(towards, axis=1), 3.0, atol=1e-12)
-    np.testing.assert_allclose(-poses[:, :, 2], towards / 3, atol=1e-12)
+    actual = np.linalg.norm(towards, axis=1)
+    assert_allclose(actual, 3.0, atol=1e-12)
+    actual = -poses[:, :, 2]
+    assert_allclose(actual, towards / 3, atol=1e-12)
     steps = np.linalg.norm(poses[:, :, 3] - np.roll(poses[:, :, 3], 1, axis=0), axis=1)
     assert steps.max() < 0.6 and steps.min() > 0
 
@@ -60,7 +63,8 @@ def test_a_picture_shows_the_splat_and_beside_it_the_shrunk_gaussians(tmp_path: 
     pipeline = SimpleNamespace(model=Model(), datamanager=SimpleNamespace(train_dataset=dataset))
     options = turn.Turn(Path("run"), tmp_path / "turn.webp", frames=3, width=40, shrink=2.0)
     pictures = turn.draw(pipeline, options)  # type: ignore[arg-type]
-    assert [picture.shape for picture in pictures] == [(30, 80, 3)] * 3
+    shapes = [picture.shape for picture in pictures]
+    assert shapes == [(30, 80, 3)] * 3
     assert pictures[0][0, 0].tolist() == [102] * 3 and pictures[0][0, 79].tolist() == [101] * 3
     for name in ("scales", "opacities"):
         assert pipeline.model.gauss_params[name].abs().max() < 1e-6
@@ -75,7 +79,8 @@ def test_the_file_moves_and_begins_again(name: str, tmp_path: Path):
         image.seek(1)
         image.load()
         assert image.info["duration"] == 200
-    assert [path.name for path in tmp_path.iterdir()] == [name]
+    names = [path.name for path in tmp_path.iterdir()]
+    assert names == [name]
 
 
 @pytest.mark.parametrize(
@@ -90,16 +95,20 @@ def test_wrong_input_is_refused_in_a_sentence(
     words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
-    assert turn.main(["run", *words]) == 2
-    assert sentence in capsys.readouterr().err
+    status = turn.main(["run", *words])
+    assert status == 2
+    errors = capsys.readouterr().err
+    assert sentence in errors
     assert not list(tmp_path.iterdir())
 
 
 def test_the_gallery_s_page_begins_at_the_drawn_scene_s_first_camera():
     view = arc_views(9, 320, 240)[0]
-    np.testing.assert_allclose(gallery_page.START.position, view.position, atol=1e-3)
+    assert_allclose(gallery_page.START.position, view.position, atol=1e-3)
     forward = np.subtract(gallery_page.START.target, view.position)
-    np.testing.assert_allclose(forward / np.linalg.norm(forward), view.rotation[2], atol=1e-3)
+    actual = forward / np.linalg.norm(forward)
+    expected = view.rotation[2]
+    assert_allclose(actual, expected, atol=1e-3)
     assert math.tan(math.radians(gallery_page.START.degrees) / 2) == pytest.approx(
         view.width / 2 / view.focal, abs=1e-3
     )
@@ -111,7 +120,8 @@ def test_the_gallery_has_the_link_where_the_page_was_made_and_nothing_where_it_w
     assert text.count(gallery_page.MARKER) == 1
     for made, links in (("a page", 1), (None, 0)):
         files = SimpleNamespace(get_file_from_path=lambda name, made=made: made)
-        assert gallery_page.on_page_markdown(text, page, None, files).count(gallery_page.LINK) == links
+        actual = gallery_page.on_page_markdown(text, page, None, files).count(gallery_page.LINK)
+        assert actual == links
 
 
 def test_without_what_makes_pages_the_site_is_built_without_the_page(
@@ -122,5 +132,6 @@ def test_without_what_makes_pages_the_site_is_built_without_the_page(
 
     monkeypatch.setattr(gallery_page, "page_of", refuse)
     with caplog.at_level("INFO"):
-        assert gallery_page.on_files([], SimpleNamespace(docs_dir="docs")) == []
+        actual = gallery_page.on_files([], SimpleNamespace(docs_dir="docs"))
+        assert actual == []
     assert "no page of the drawn room. room.ply: there is no Node.js." in caplog.text

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from helpers.fake_node import put_node_into_path
+from helpers.json_files import read_json
 from sadgs_ns.cli.sadgs_options import choose_formats
 from sadgs_ns.formats import page_writer
 
@@ -27,13 +27,13 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache without the program, and an npm that needs no network."""
     put_node_into_path(tmp_path / "programs", "", NPM, monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return tmp_path / "cache" / "sadgs_ns"
+    return tmp_path / "cache/sadgs_ns"
 
 
 def test_the_lock_file_pins_every_package_by_its_hash_and_names_no_server():
-    lock = json.loads((page_writer.PACKAGES / "package-lock.json").read_text())
+    lock = read_json(page_writer.PACKAGES / "package-lock.json")
     packages = {name: package for name, package in lock["packages"].items() if name}
-    wanted = json.loads((page_writer.PACKAGES / "package.json").read_text())["dependencies"]
+    wanted = read_json(page_writer.PACKAGES / "package.json")["dependencies"]
     assert lock["packages"][""]["dependencies"] == wanted
     assert str(page_writer.PROGRAM).split("/bin/")[0] in packages
     for package in packages.values():
@@ -47,7 +47,8 @@ def test_the_program_is_installed_once_without_running_scripts_of_its_packages(c
     page_writer.install()
     page_writer.install()
     assert page_writer.is_installed()
-    assert list(cache.iterdir()) == [page_writer.folder()]
+    actual = list(cache.iterdir())
+    assert actual == [page_writer.folder()]
     ran = (page_writer.folder() / "ran.txt").read_text().splitlines()
     assert len(ran) == 1
     assert ran[0].startswith("ci ")
@@ -65,7 +66,8 @@ def test_a_program_that_another_process_installed_meanwhile_is_taken(cache: Path
 
     monkeypatch.setattr(page_writer.subprocess, "run", run_while_another_installs)
     page_writer.install()
-    assert list(cache.iterdir()) == [page_writer.folder()]
+    actual = list(cache.iterdir())
+    assert actual == [page_writer.folder()]
 
 
 @pytest.mark.hard_case(
@@ -88,9 +90,11 @@ def test_a_page_is_made_by_default_if_its_program_is_there_or_the_user_lets_it_b
     assert choose_formats(None, False, console) == expected
     printed: Any = console.file
     assert ("--formats html,ply does that once" in printed.getvalue()) == (expected == ["ply"])
-    assert [page_writer.DOWNLOAD in question for question in questions] == [True] * (answer is not None)
+    actual = [page_writer.DOWNLOAD in question for question in questions]
+    assert actual == [True] * (answer is not None)
     assert choose_formats("html,ply", False, console) == ["ply", "html"], "who names the format wants the download"
     page_writer.install()
     questions.clear()
-    assert choose_formats(None, False, console) == ["ply", "html"]
+    actual = choose_formats(None, False, console)
+    assert actual == ["ply", "html"]
     assert questions == []

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
 from helpers.small_scenes import camera, random_params
 from sadgs_ns.geometry.cleaning import Cleaning, Visibility, choose_remaining, measure_visibility
@@ -84,7 +85,8 @@ def test_what_is_not_finite_is_not_seen_and_hides_nothing():
     params["opacities"][2, 0] = math.nan
     seen = measure_visibility(params, [view()])
     assert seen.views.tolist() == [0, 0, 0, 1]
-    torch.testing.assert_close(seen.pixels[3:], expected)
+    actual = seen.pixels[3:]
+    assert_close(actual, expected)
 
 
 def test_each_option_takes_what_it_says_and_how_many_is_counted():
@@ -100,5 +102,6 @@ def test_each_option_takes_what_it_says_and_how_many_is_counted():
     ):
         remaining = choose_remaining(params, cleaning, seen)
         assert remaining.stays.int().tolist() == stays
-        assert list(remaining.num_removed.items()) == list(num_removed.items())
+        actual = list(remaining.num_removed.items())
+        assert actual == list(num_removed.items())
         assert remaining.num_views == (5 if cleaning.needs_views else 0)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.closeness import assert_within
 from sadgs_ns.geometry.dense_start import SCALE, DensePoints, dense_points
 from sadgs_ns.geometry.stereo import DepthMap
 
@@ -59,7 +60,7 @@ class Views:
         assert agreeing.sum(dim=0)[sure].min() >= 2
         expected = agreeing.float().T @ COLORS / agreeing.sum(dim=0)[:, None]
         actual = drawn.colors[sure]
-        torch.testing.assert_close(actual, expected[sure], rtol=0, atol=1e-5)
+        assert_within(actual, expected[sure], 1e-5)
 
 
 def test_points_lie_on_the_surface_with_the_mean_colour_of_the_views_that_see_them():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from sadgs_ns.geometry import exposure
 from sadgs_ns.geometry.exposure import FEWEST_POINTS, Observations, fit_exposures, gains_of_others, points_at_median
@@ -31,9 +32,9 @@ def test_known_gains_and_colours_are_found_and_the_median_gain_is_1():
     observations, gains, colors = drawn()
     found = fit_exposures(observations, VIEWS, POINTS)
     assert found.known.all()
-    np.testing.assert_allclose(found.stops, gains, atol=0.03)
+    assert_allclose(found.stops, gains, atol=0.03)
     actual = np.median(found.stops, axis=0)
-    np.testing.assert_allclose(actual, 0, atol=1e-12)
+    assert_allclose(actual, 0, atol=1e-12)
     assert np.abs(found.points - colors).mean() < 0.05
     means = gains.mean(axis=1)
     assert found.deviation == pytest.approx(means.std(), abs=0.02)
@@ -48,7 +49,7 @@ def test_gains_withstand_a_fifth_of_wrong_observations():
     wrong = generator.random(len(observations.views)) < 0.2
     observations.stops[wrong] += generator.uniform(-3, 3, (int(wrong.sum()), 3))
     actual = fit_exposures(observations, VIEWS, POINTS).stops
-    np.testing.assert_allclose(actual, gains, atol=0.05)
+    assert_allclose(actual, gains, atol=0.05)
 
 
 @pytest.mark.hard_case("a photo that shares few points with others", "has a gain of 1, and moves no other gain")
@@ -66,7 +67,8 @@ def test_a_photo_with_few_points_has_a_gain_of_1_and_does_not_move_the_others():
     assert found.known.tolist() == others.tolist()
     assert not found.stops[3].any()
     expected = gains[others] - np.median(gains[others], axis=0)
-    np.testing.assert_allclose(found.stops[others], expected, atol=0.05)
+    actual = found.stops[others]
+    assert_allclose(actual, expected, atol=0.05)
 
 
 def test_photos_with_one_exposure_have_no_spread_beyond_noise():
@@ -95,7 +97,7 @@ def test_photos_that_were_not_fitted_get_gains_by_the_points_colours():
     found, known = gains_of_others(observations.of_views(~fitted), light, VIEWS)
     assert known.tolist() == (~fitted).tolist()
     expected = np.where(fitted[:, None], 0.0, gains)
-    np.testing.assert_allclose(found, expected, atol=0.03)
+    assert_allclose(found, expected, atol=0.03)
 
 
 def test_many_observations_are_thinned_out_by_points(monkeypatch: pytest.MonkeyPatch):
@@ -104,4 +106,4 @@ def test_many_observations_are_thinned_out_by_points(monkeypatch: pytest.MonkeyP
     found = fit_exposures(observations, VIEWS, POINTS)
     known = np.isfinite(found.points).all(axis=1)
     assert known.sum() == pytest.approx(POINTS / 3, abs=1)
-    np.testing.assert_allclose(found.stops, gains, atol=0.05)
+    assert_allclose(found.stops, gains, atol=0.05)

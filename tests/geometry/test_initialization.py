@@ -6,7 +6,9 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.geometry.initialization import (
     FACE_GRID,
     bounding_box_points,
@@ -36,11 +38,11 @@ def test_scales_are_the_mean_distance_to_three_neighbours():
 
 
 def test_scales_of_a_cloud_are_those_of_all_distances():
-    points = torch.rand((500, 3), generator=torch.Generator().manual_seed(0))
+    points = torch.rand((500, 3), generator=seeded(0))
     points[100:110] = points[200]  # duplicates are at distance 0
     distances = torch.cdist(points.double(), points.double(), compute_mode="donot_use_mm_for_euclid_dist")
     expected = distances.sort(dim=1).values[:, 1:4].mean(dim=1).float().clamp_min(1e-6)
-    torch.testing.assert_close(neighbour_scales(points), expected, rtol=1e-5, atol=2e-6)
+    assert_close(neighbour_scales(points), expected, rtol=1e-5, atol=2e-6)
 
 
 @pytest.mark.parametrize("points", [[[0.0, 0, 0]], [[0.0, 0, 0]] * 5, [[0.0, 0, 0], [1.0, 0, 0]]])
@@ -50,12 +52,12 @@ def test_few_or_equal_points_have_finite_log_scales(points: list[list[float]]):
 
 
 def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them():
-    points, colors = torch.rand((2, 20, 3), generator=torch.Generator().manual_seed(0))
+    points, colors = torch.rand((2, 20, 3), generator=seeded(0))
     alone = starting_points(points, colors, faces=False)
     assert alone[0] is points
     assert alone[1] is colors
     assert (alone[3] == 0.1).all()
-    torch.testing.assert_close(alone[2], neighbour_scales(points))
+    assert_close(alone[2], neighbour_scales(points))
     faces, spacing = bounding_box_points(points)
     for value, before, added in zip(
         starting_points(points, colors, faces=True), alone, (faces, 0.5, spacing, 0.05), strict=True
@@ -63,7 +65,7 @@ def test_points_come_first_and_the_faces_faint_grey_and_a_cell_large_after_them(
         assert torch.equal(value[:20], before)
         assert len(value) == 20 + len(faces)
         expected = torch.as_tensor(added).expand_as(value[20:])
-        torch.testing.assert_close(value[20:], expected)
+        assert_close(value[20:], expected)
 
 
 def test_images_of_few_pixels_bound_the_start_and_usual_ones_do_not():
@@ -80,7 +82,7 @@ def test_images_of_few_pixels_bound_the_start_and_usual_ones_do_not():
 
 
 def test_coarser_faces_have_larger_points():
-    points = torch.rand((20, 3), generator=torch.Generator().manual_seed(0))
+    points = torch.rand((20, 3), generator=seeded(0))
     colors = torch.zeros_like(points)
     fine = starting_points(points, colors, faces=True)
     coarse = starting_points(points, colors, faces=True, grid=4)
@@ -88,4 +90,4 @@ def test_coarser_faces_have_larger_points():
     assert len(coarse[0]) == 20 + 6 * 4**2
     actual = coarse[2][-1]
     expected = 4 * fine[2][-1]
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)

@@ -7,7 +7,9 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.geometry import moved
 from sadgs_ns.geometry.moved import (
     SmallView,
@@ -69,7 +71,9 @@ def test_an_edge_a_pixel_beside_its_place_is_no_difference_and_another_colour_is
     everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     assert float(difference(photo, drawn, everywhere).max()) < 1e-6
     other = difference(photo, 1 - photo, everywhere)
-    torch.testing.assert_close(other[20, 5], torch.tensor(1.0))
+    actual = other[20, 5]
+    expected = torch.tensor(1.0)
+    assert_close(actual, expected)
 
 
 def test_hidden_pixels_do_not_differ_and_do_not_reach_those_beside_them():
@@ -84,7 +88,8 @@ def test_what_one_view_shows_alone_is_in_its_excess():
     views = [view_at(0.0, pixels(*THING)), view_at(-0.4), view_at(0.4), view_at(0.8)]
     found = excess(views[0], views[1:])
     inside = pixels(*THING)
-    torch.testing.assert_close(found[inside], torch.full((144,), 0.3))
+    expected = torch.full((144,), 0.3)
+    assert_close(found[inside], expected)
     assert float(found[~inside & found.isfinite()].abs().max()) == 0.0
 
 
@@ -104,7 +109,8 @@ def test_views_that_look_through_a_point_at_what_is_behind_deny_it():
     near = view_at(0.0, thing)
     near.depth[thing] = 3.0
     found = excess(near, [view_at(-0.4), view_at(0.4), view_at(0.8)])
-    torch.testing.assert_close(found[thing], torch.full((144,), 0.3))
+    expected = torch.full((144,), 0.3)
+    assert_close(found[thing], expected)
 
 
 def test_too_few_views_and_hidden_pixels_are_no_evidence():
@@ -118,14 +124,15 @@ def test_too_few_views_and_hidden_pixels_are_no_evidence():
 
 
 def test_the_spread_is_that_of_most_pixels_whatever_a_few_are():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     values = 0.01 * torch.randn((100, 100), generator=generator)
     values[:10] = 5.0
     values[10] = math.nan
     limits = spread([values])
     assert limits.deviation == pytest.approx(0.01, rel=0.2) and abs(limits.median) < 0.005
     assert limits.strong == pytest.approx(limits.median + moved.STRONG * limits.deviation)
-    assert spread([torch.full((4, 4), math.nan)]) == Spread(0.0, 0.0)
+    actual = spread([torch.full((4, 4), math.nan)])
+    assert actual == Spread(0.0, 0.0)
 
 
 def test_small_excesses_are_no_reason_however_alike_all_others_are():
@@ -166,7 +173,7 @@ def test_another_light_is_no_thing():
 
 def test_structure_is_what_does_not_change_slowly():
     everywhere = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
-    photo = torch.rand((3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(0))
+    photo = torch.rand((3, HEIGHT, WIDTH), generator=seeded(0))
     light = torch.linspace(0, 0.3, WIDTH).expand(3, HEIGHT, WIDTH)
     inner = slice(moved.WIDE // 2, -(moved.WIDE // 2))
     assert float(structure(photo + light, photo, everywhere)[:, inner].max()) < 0.02
@@ -195,4 +202,6 @@ def test_points_lie_on_what_is_drawn():
     nothing = view_at(0.4, depth=0.0)
     points = surface_points([view_at(0.0), nothing])
     assert len(points) > 500
-    torch.testing.assert_close(points[:, 2], torch.full((len(points),), WALL, dtype=torch.float64))
+    actual = points[:, 2]
+    expected = torch.full((len(points),), WALL, dtype=torch.float64)
+    assert_close(actual, expected)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.geometry import near_plane
 from sadgs_ns.geometry.near_plane import NEAR_SHARE, NEAREST_POINTS, UNKNOWN_SHARE
 from sadgs_ns.render.rasterization import rasterize
@@ -33,7 +35,8 @@ def wall(depth: float, middle: float = 5.0, width: float = 14.0, number: int = 4
 
 
 def test_the_plane_is_a_share_of_the_depth_of_what_is_nearest():
-    assert scene_near_plane(wall(8.0), *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
+    actual = scene_near_plane(wall(8.0), *row_of_cameras())
+    assert actual == pytest.approx(8.0 * NEAR_SHARE)
 
 
 @pytest.mark.hard_case("a scene in other units", "the near plane scales with the units")
@@ -65,14 +68,16 @@ def test_a_few_wrong_points_before_a_camera_do_not_move_the_plane():
     wrong = torch.tensor([[2.0, 0.0, 1e-3]]).repeat(NEAREST_POINTS - 1, 1)
     broken = torch.tensor([[torch.nan, 0, 1], [2, 0, torch.inf]])
     points = torch.cat([wrong, broken, wall(8.0)])
-    assert scene_near_plane(points, *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
+    actual = scene_near_plane(points, *row_of_cameras())
+    assert actual == pytest.approx(8.0 * NEAR_SHARE)
 
 
 def test_points_behind_and_beside_the_cameras_do_not_count():
     behind = wall(-0.1)
     beside = wall(0.2, middle=-9.0, width=2.0)
     points = torch.cat([behind, beside, wall(8.0)])
-    assert scene_near_plane(points, *row_of_cameras()) == pytest.approx(8.0 * NEAR_SHARE)
+    actual = scene_near_plane(points, *row_of_cameras())
+    assert actual == pytest.approx(8.0 * NEAR_SHARE)
 
 
 @pytest.mark.parametrize(
@@ -81,16 +86,18 @@ def test_points_behind_and_beside_the_cameras_do_not_count():
     ids=["none", "few", "behind"],
 )
 def test_where_no_camera_sees_enough_points_the_cameras_extent_decides(points: Tensor):
-    assert scene_near_plane(points, *row_of_cameras()) == pytest.approx(UNKNOWN_SHARE * EXTENT)
+    actual = scene_near_plane(points, *row_of_cameras())
+    assert actual == pytest.approx(UNKNOWN_SHARE * EXTENT)
 
 
 def test_turned_cameras_measure_along_their_own_axes():
     """Cameras around a ball of points: the nearest of them lie a radius before its middle."""
-    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=torch.Generator().manual_seed(0)), dim=1)
-    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    directions = torch.nn.functional.normalize(torch.randn(20, 3, generator=seeded(0)), dim=1)
+    points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=seeded(1)), dim=1)
     _, Ks, sizes = row_of_cameras(20)
     viewmats = looking_at_the_origin(4.0 * directions)
-    assert scene_near_plane(points, viewmats, Ks, sizes) == pytest.approx(3.0 * NEAR_SHARE, rel=0.01)
+    actual = scene_near_plane(points, viewmats, Ks, sizes)
+    assert actual == pytest.approx(3.0 * NEAR_SHARE, rel=0.01)
 
 
 def looking_at_the_origin(centres: Tensor) -> Tensor:
@@ -123,4 +130,5 @@ def test_a_faint_gaussian_before_a_camera_is_haze_without_the_plane_and_nothing_
 
     clean = draw(1, 0.01)
     assert (draw(2, 0.01) - clean).abs().mean() > 0.1
-    torch.testing.assert_close(draw(2, 4.0), clean)
+    actual = draw(2, 4.0)
+    assert_close(actual, clean)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within, assert_within_share
+from helpers.generators import seeded
 from sadgs_ns.geometry import poses
 from sadgs_ns.geometry.poses import Gauge
 
@@ -15,7 +18,7 @@ SIZE = (320, 240)
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.randn(shape, generator=seeded(seed), dtype=torch.float64)
 
 
 def orbit(number: int = 12) -> Tensor:
@@ -49,7 +52,7 @@ def matrix(rotation_vector: Tensor) -> Tensor:
 def test_the_exponential_map_and_its_gradient_are_exact_to_rounding_at_every_angle(length: float):
     vector = torch.nn.functional.normalize(torch.tensor([0.3, -0.7, 0.5], dtype=torch.float64), dim=0) * length
     actual = poses.rotations(vector)
-    torch.testing.assert_close(actual, matrix(vector), rtol=0, atol=2e-15)
+    assert_within(actual, matrix(vector), 2e-15)
     upstream = random(3, 3, seed=2)
 
     def gradient(value: Tensor) -> Tensor:
@@ -64,14 +67,14 @@ def test_the_exponential_map_and_its_gradient_are_exact_to_rounding_at_every_ang
     generator = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
     (torch.matrix_exp(generator) * upstream).sum().backward()
     assert exact.grad is not None
-    torch.testing.assert_close(gradient(vector), exact.grad, rtol=0, atol=1e-13)
+    assert_within(gradient(vector), exact.grad, 1e-13)
     rounded = vector.float()
     actual = poses.rotations(rounded).double()
     expected = matrix(rounded.double())
-    torch.testing.assert_close(actual, expected, rtol=0, atol=4 * EPS32)
+    assert_within(actual, expected, 4 * EPS32)
     actual = gradient(rounded).double()
     expected = gradient(rounded.double())
-    torch.testing.assert_close(actual, expected, rtol=0, atol=20 * EPS32)
+    assert_within(actual, expected, 20 * EPS32)
 
 
 def test_a_correction_moves_points_in_the_camera_s_frame():
@@ -84,7 +87,7 @@ def test_a_correction_moves_points_in_the_camera_s_frame():
     after = points @ found[:, :3, :3].mT + found[:, None, :3, 3]
     turned = torch.stack([matrix(row[:3]) for row in corrections])
     expected = before @ turned.mT + corrections[:, None, 3:]
-    torch.testing.assert_close(after, expected, rtol=0, atol=1e-13)
+    assert_within(after, expected, 1e-13)
     assert torch.equal(poses.corrected(viewmats, torch.zeros(4, 6, dtype=torch.float64)), viewmats)
 
 
@@ -113,7 +116,7 @@ def test_image_motion_is_the_mean_square_of_how_far_pixels_move():
         row = torch.zeros(5, 6, dtype=torch.float64)
         row[:, column] = one_pixel[:, column]
         actual = (row[:, None] @ motion @ row[..., None]).flatten()
-        torch.testing.assert_close(actual, torch.ones(5).double())
+        assert_close(actual, torch.ones(5).double())
 
 
 def test_depths_of_views_are_quartiles_of_the_points_in_their_images():
@@ -125,7 +128,7 @@ def test_depths_of_views_are_quartiles_of_the_points_in_their_images():
     sizes = torch.tensor([SIZE], dtype=torch.float64).expand(3, 2)
     found = poses.view_depths(viewmats, intrinsics(3), sizes, torch.cat([before, beside]))
     expected = torch.tensor([[2.0, 3.0, 4.0]]).double().expand(3, 3)
-    torch.testing.assert_close(found, expected)
+    assert_close(found, expected)
     nothing = poses.view_depths(viewmats, intrinsics(3), sizes, before[:0])
     assert torch.equal(nothing, torch.ones_like(nothing))
 
@@ -153,7 +156,7 @@ def test_a_common_motion_of_all_cameras_is_taken_out_to_rounding(dtype: torch.dt
     direction = random(7, seed=7)
     common = moved_together(viewmats, size * direction[:3], size * direction[3:6], size * float(direction[6]))
     actual = gauge.common_motion(common.to(dtype)).double()
-    torch.testing.assert_close(actual, size * direction, rtol=1e-4, atol=0)
+    assert_within_share(actual, size * direction, 1e-4)
     table = common.to(dtype)
     gauge.take_out(table)
     # The square of the motion is below the rounding of corrections of a thousandth.
@@ -168,11 +171,11 @@ def test_what_cameras_do_not_have_in_common_is_kept():
     gauge.take_out(relative)
     kept = relative.clone()
     gauge.take_out(kept)
-    torch.testing.assert_close(kept, relative, rtol=0, atol=1e-17)
+    assert_within(kept, relative, 1e-17)
     common = moved_together(viewmats, *(1e-8 * random(2, 3, seed=9)), scale=1e-8)
     both = relative + common
     gauge.take_out(both)
-    torch.testing.assert_close(both, relative, rtol=0, atol=1e-14)
+    assert_within(both, relative, 1e-14)
 
 
 def test_a_rotation_that_a_translation_undoes_in_the_images_is_no_common_motion():

@@ -6,7 +6,10 @@ import math
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from helpers.gsplat_like import splatted
 from sadgs_ns.geometry import scale_limits
 from sadgs_ns.geometry.scale_limits import camera_distances, limit_scales
@@ -23,7 +26,7 @@ def test_points_are_clear_of_cameras_from_their_radius_on():
 @pytest.mark.hard_case("cameras and points far from the origin", "distances to cameras are exact")
 @pytest.mark.parametrize("offset", [0.0, 1_000.0, 100_000.0])
 def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     means = torch.rand((5_000, 3), generator=generator) + offset
     positions = torch.rand((40, 3), generator=generator) + offset
     distances = (means.double()[:, None] - positions.double()).norm(dim=-1).amin(dim=1)  # [5000]
@@ -33,7 +36,7 @@ def test_distances_to_cameras_are_exact_far_from_the_origin(offset: float):
 
 @pytest.mark.parametrize("offset", [0.0, 1_000.0])
 def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: float, monkeypatch: pytest.MonkeyPatch):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     means = 10 * torch.rand((500, 3), generator=generator) + offset
     positions = 10 * torch.rand((7, 3), generator=generator) + offset
     scales = 3 * torch.randn((500, 3), generator=generator)
@@ -45,7 +48,7 @@ def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: floa
         limited = torch.nn.Parameter(scales.clone())
         limit_scales(limited, means, positions, 0.5)
         actual = limited.detach().double()
-        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-5)
+        assert_within(actual, expected, 1e-5)
         assert torch.equal(limited.detach()[expected == scales], scales[expected == scales])
 
 
@@ -55,7 +58,7 @@ def test_only_axes_that_are_too_long_for_the_distance_are_shortened(offset: floa
 def test_many_cameras_limit_the_same_axes_to_the_same_length(
     number: int, offset: float, monkeypatch: pytest.MonkeyPatch
 ):
-    generator = torch.Generator().manual_seed(number)
+    generator = seeded(number)
     positions = torch.rand((number, 3), generator=generator).cumsum(dim=0) + offset
     means = positions[torch.arange(600) % number] + 5 * torch.randn((600, 3), generator=generator)
     scales = 2 * torch.randn((600, 3), generator=generator) - 1
@@ -68,7 +71,7 @@ def test_many_cameras_limit_the_same_axes_to_the_same_length(
     monkeypatch.setattr(scale_limits, "MANY_CAMERAS", 10)
     monkeypatch.setattr(scale_limits, "_GROUP", 4)
     limit_scales(many, means, positions, 0.5)
-    torch.testing.assert_close(many, each, rtol=0, atol=0, equal_nan=True)
+    assert_close(many, each, rtol=0, atol=0, equal_nan=True)
     radii = torch.rand(600, generator=generator) * 8
     found = camera_distances(means, positions, radii)
     assert torch.equal(found >= radii, distances >= radii)

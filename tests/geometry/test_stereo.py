@@ -7,7 +7,9 @@ import math
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.geometry import stereo
 from sadgs_ns.geometry.stereo import DepthMap, depth_maps
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
@@ -34,7 +36,7 @@ def trace(planes: str, viewmat: Tensor, K: Tensor, height: int, width: int) -> t
 
 def texture(points: Tensor) -> Tensor:
     """Grey values in [0, 1] of points in space: sines of 8 to 60 px. [..., 3] → [...]"""
-    directions = torch.randn((24, 3), generator=torch.Generator().manual_seed(0)).double()
+    directions = torch.randn((24, 3), generator=seeded(0)).double()
     waves = directions / directions.norm(dim=1, keepdim=True) * torch.logspace(0.2, 1.1, 24).double()[:, None]
     return (0.5 + 0.06 * torch.sin(points @ waves.T + torch.arange(24)).sum(dim=-1)).clamp(0, 1)
 
@@ -85,7 +87,7 @@ def test_depths_of_planes_are_found(planes: str):
     check(maps, planes, viewmats, 0.8)
     for depth_map, K in zip(maps, Ks, strict=True):
         assert depth_map.depth.shape == depth_map.confidence.shape == (HEIGHT, WIDTH)
-        torch.testing.assert_close(depth_map.K, K.float())
+        assert_close(depth_map.K, K.float())
 
 
 @pytest.mark.parametrize("planes", PLANES)
@@ -101,7 +103,8 @@ def test_views_may_differ_in_size_and_be_loaded_one_by_one():
     sizes = [(WIDTH, HEIGHT) if v % 2 else (HEIGHT, WIDTH) for v in range(5)]
     images, viewmats, Ks, points = capture(sizes=sizes)
     maps = depth_maps(images.__getitem__, viewmats, Ks, points, device="cpu")
-    assert [tuple(depth_map.depth.shape[::-1]) for depth_map in maps] == sizes
+    actual = [tuple(depth_map.depth.shape[::-1]) for depth_map in maps]
+    assert actual == sizes
     check(maps, "slanted", viewmats)
 
 
@@ -176,7 +179,7 @@ def test_neighbours_see_the_same_points_from_good_angles():
 @pytest.mark.parametrize("level", range(stereo.LEVELS))
 def test_correlations_are_those_of_plain_loops(level: int):
     images, viewmats, Ks, points = capture("ridge", 2)
-    masks = [torch.rand((HEIGHT, WIDTH), generator=torch.Generator().manual_seed(v)) > 0.01 for v in range(2)]
+    masks = [torch.rand((HEIGHT, WIDTH), generator=seeded(v)) > 0.01 for v in range(2)]
     pyramids = [stereo._pyramid(*pair, torch.device("cpu")) for pair in zip(images, masks, strict=True)]
     view, _ = stereo._views(pyramids, viewmats, Ks, torch.tensor([[WIDTH, HEIGHT]] * 2).double(), points)
     image, other = (pyramid[level] for pyramid in pyramids)

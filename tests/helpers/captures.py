@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
+from helpers.json_files import read_json, write_json
 from helpers.short_runs import nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 
@@ -47,12 +47,12 @@ def write_capture(layout: str, folder: Path, scene: Path) -> Capture:
     elif layout != "sparse/0":
         shutil.rmtree(folder / "images")
         nerfstudio_data(folder)
-    mask = folder / "masks" / "000.png"
+    mask = folder / "masks/000.png"
     mask.parent.mkdir()
     Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
     if cameras.name == "transforms.json":
-        described = json.loads(cameras.read_text())
+        described = read_json(cameras)
         described["frames"] = [frame | {"mask_path": r"masks\000.png"} for frame in described["frames"]]
-        cameras.write_text(json.dumps(described))
+        write_json(cameras, described)
     given = cameras if layout == "file" else folder
     return Capture(folder, given, cameras, mask)

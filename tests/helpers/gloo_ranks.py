@@ -40,7 +40,8 @@ def run_ranks(
         for process in processes:
             process.join(max(end - time.monotonic(), 0))
         expected = [-9 if r in doomed else 0 for r in range(number)]
-        assert [process.exitcode for process in processes] == expected
+        exitcodes = [process.exitcode for process in processes]
+        assert exitcodes == expected
     finally:
         for process in processes:
             process.kill()

@@ -248,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     assert run(disturbed) == 0
     name = f"step-{given.iterations - 1:09d}.ckpt"
     ends = [
-        torch.load(given.folder / run_name / "test" / "sadgs" / "run" / "nerfstudio_models" / name, weights_only=True)
+        torch.load(given.folder / run_name / "test/sadgs/run/nerfstudio_models" / name, weights_only=True)
         for run_name in ("undisturbed", "disturbed", "other seed")
     ]
     counts = [len(end["pipeline"]["_model.gauss_params.means"]) for end in ends]

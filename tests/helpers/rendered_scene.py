@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from helpers.generators import seeded
 from helpers.gsplat_like import rasterization
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.render.rasterization import visible
@@ -25,7 +26,7 @@ def random_scene(gaussians: int, size: int, seed: int) -> dict[str, Tensor]:
     Returns:
         float64 CPU tensors: the arguments of `rasterize` by name, and `weights` [1, S, S, 3].
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
 
     def uniform(low: float, high: float, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from helpers.generators import seeded
 from helpers.small_scenes import random_params
 from sadgs_ns.render.types import Cameras, Gaussians
 
@@ -27,7 +28,7 @@ def cameras(views: int) -> tuple[Tensor, Tensor]:
 def inputs(part: slice = slice(None)) -> dict[str, Tensor]:
     """What `rasterize` takes of Gaussians, as leaves."""
     params = {name: value.detach() for name, value in random_params(GAUSSIANS, seed=3).items()}
-    harmonics = torch.randn((GAUSSIANS, 4, 3), generator=torch.Generator().manual_seed(1))
+    harmonics = torch.randn((GAUSSIANS, 4, 3), generator=seeded(1))
     values = {
         "means": params["means"],
         "quats": params["quats"],
@@ -48,4 +49,4 @@ def splats(leaves: dict[str, Tensor], views: int) -> tuple[Gaussians, Cameras]:
 
 def weights(views: int) -> Tensor:
     """What the pixels' sum in the loss is weighted with, so that each gradient is its own."""
-    return torch.rand((views, HEIGHT, WIDTH, 4), generator=torch.Generator().manual_seed(2))
+    return torch.rand((views, HEIGHT, WIDTH, 4), generator=seeded(2))

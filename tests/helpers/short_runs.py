@@ -21,6 +21,7 @@ from PIL import Image
 
 from examples.drawn_scene.drawing import render
 from examples.drawn_scene.scene import arc_views, room_surfaces
+from helpers.json_files import write_json
 from helpers.kill_and_resume import set_up
 from helpers.small_scenes import HEIGHT, POINTS, VIEWS, WIDTH
 from sadgs_ns.training.config import SadgsTrainerConfig
@@ -131,7 +132,7 @@ def nerfstudio_data(
 ) -> NerfstudioDataParserConfig:
     """A dataset as ns-process-data writes it, without SfM points."""
     described = frames(folder, sizes, **options)
-    (folder / "transforms.json").write_text(json.dumps({"camera_model": "OPENCV", "frames": described}))
+    write_json(folder / "transforms.json", {"camera_model": "OPENCV", "frames": described})
     return NerfstudioDataParserConfig(data=folder, load_3D_points=True, downscale_factor=1)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from helpers.generators import seeded
 from helpers.gsplat_like import splatted
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
@@ -24,7 +25,7 @@ CHECKER_SIZE = 32, 24
 
 def random_params(n: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> dict[str, torch.nn.Parameter]:
     """Gaussians in gsplat's parameters, about 4 units in front of a camera at the origin."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(shape, generator=generator, dtype=dtype)
@@ -58,7 +59,7 @@ def camera(width: int = 64, height: int = 48, focal: float = 60.0, dtype: torch.
 
 def cameras_at(centres: Tensor, seed: int = 0) -> Tensor:
     """viewmats of cameras at centres [C, 3], turned at random. [C, 4, 4]"""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     viewmats = torch.eye(4).repeat(len(centres), 1, 1)
     viewmats[:, :3, :3] = torch.linalg.qr(torch.randn((len(centres), 3, 3), generator=generator))[0]
     viewmats[:, :3, 3:] = -viewmats[:, :3, :3] @ centres[..., None].float()

@@ -9,12 +9,17 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
+from torch.testing import assert_close
 
 from helpers import small_scenes
+from helpers.closeness import assert_within, assert_within_peak
+from helpers.generators import seeded
 from helpers.gsplat_like import rasterization
-from sadgs_ns import gsplat_compat
+from helpers.rendered_scene import random_scene
+from sadgs_ns import gsplat_compat, kernels
 from sadgs_ns.kernels import triton_switched
 from sadgs_ns.method.screen_gradients import accumulate_gradients, empty_gradients, keep_gradient
+from sadgs_ns.render import backend_gsplat
 from sadgs_ns.render.rasterization import visible
 
 compositing = pytest.importorskip("sadgs_ns.kernels.compositing", reason="Triton is not installed")
@@ -32,7 +37,7 @@ def make_scene(
     kind: str, num_views: int = 1, n: int = 60, width: int = 21, height: int = 18, tiny: float = TINY
 ) -> dict[str, Any]:
     """Projected Gaussians with their tile lists, and gradients of what they render."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
 
     def random(*shape: int) -> Tensor:
         return torch.rand((num_views, n, *shape), generator=generator)
@@ -170,10 +175,10 @@ def test_what_is_drawn_equals_the_plain_formula_in_float64(kind):
     tolerance = 2e-5 if kind in ("long and thin", "huge") else 2e-6
     actual = renders[agrees].double()
     expected = scene["renders"][agrees]
-    torch.testing.assert_close(actual, expected, atol=tolerance, rtol=0)
+    assert_within(actual, expected, tolerance)
     actual = found[agrees].double()
-    torch.testing.assert_close(actual, alphas[agrees], atol=tolerance, rtol=0)
-    torch.testing.assert_close(found.double(), alphas, atol=1 / 255 + tolerance, rtol=0)
+    assert_within(actual, alphas[agrees], tolerance)
+    assert_within(found.double(), alphas, 1 / 255 + tolerance)
 
 
 def test_a_colour_that_is_not_finite_makes_the_pixels_nan_that_see_it_and_no_others():
@@ -226,7 +231,7 @@ def test_without_absgrad_the_rest_is_the_same():
     assert both[1].pop("absgrad") is None
     for name, value in both[0].items():
         actual = both[1][name]
-        torch.testing.assert_close(actual, value, atol=1e-6, rtol=1e-5)
+        assert_close(actual, value, atol=1e-6, rtol=1e-5)
 
 
 def test_without_a_gradient_of_alphas_it_counts_as_zero():
@@ -236,7 +241,7 @@ def test_without_a_gradient_of_alphas_it_counts_as_zero():
     expected = gradients_of(scene, alphas, last_ids)
     scene["v_alphas"] = None
     for name, value in gradients_of(scene, alphas, last_ids).items():
-        torch.testing.assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
+        assert_close(value, expected[name], atol=1e-6, rtol=1e-5)
 
 
 @pytest.mark.hard_case(
@@ -262,7 +267,7 @@ def test_a_broken_pixel_reaches_the_gaussians_that_it_sees_and_no_others(broken)
     for name in NAMES[:4]:
         assert gradients[name][0, seen].isnan().all(), name
         actual = gradients[name][0, ~seen]
-        torch.testing.assert_close(actual, expected[name][0, ~seen], atol=1e-6, rtol=1e-5)
+        assert_close(actual, expected[name][0, ~seen], atol=1e-6, rtol=1e-5)
 
 
 def test_nothing_in_sight_has_gradients_of_zero():
@@ -288,7 +293,7 @@ def test_places_that_no_list_needs_change_nothing(num_views, width, height):
         if DEVICE.type == "cpu":
             assert torch.equal(gradients[name], value), name
         else:  # atomic additions come in any order
-            torch.testing.assert_close(gradients[name], value, atol=1e-5, rtol=1e-5)
+            assert_close(gradients[name], value, atol=1e-5, rtol=1e-5)
 
 
 def test_lists_that_are_too_short_have_gradients_of_zero():
@@ -311,7 +316,7 @@ def test_tiles_without_gaussians_stay_out_of_the_others_lists():
     expected, alphas, last_ids = reference(scene)
     gradients = gradients_of(scene, alphas, last_ids)
     for name in NAMES[:4]:
-        torch.testing.assert_close(gradients[name], expected[name], atol=1e-5, rtol=1e-5)
+        assert_close(gradients[name], expected[name], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("through", ["colours and alphas", "colours", "alphas"])
@@ -338,7 +343,7 @@ def test_autograd_gets_what_the_kernel_returns(through):
             assert found is None
         else:
             actual = found.double().cpu()
-            torch.testing.assert_close(actual, value, atol=5e-4 * float(value.abs().max()), rtol=0)
+            assert_within_peak(actual, value, 5e-4)
 
 
 @pytest.mark.skipif(
@@ -356,7 +361,7 @@ def test_the_assembled_rasterizer_differentiates_as_the_splatter_does(monkeypatc
         return _fully_fused_projection(means, covariances, viewmats, Ks, width, height, near_plane=near_plane)[:4]
 
     monkeypatch.setattr(gsplat_compat, "project", project)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     viewmats = torch.eye(4).repeat(2, 1, 1)
     viewmats[1, :3, :3] = torch.linalg.qr(torch.eye(3) + 0.05 * torch.randn(3, 3, generator=generator))[0]
     viewmats[1, :3, :3] *= viewmats[1, :3, :3].diagonal().sign()
@@ -449,3 +454,22 @@ def test_gradients_are_as_close_to_float64_as_gsplats(kind):
         stated = {"absgrad": 3e-4, "conics": 1e-6 / TINY**2}
     for name, error in errors[0].items():
         assert error < max(2 * errors[1][name], stated.get(name, 1e-5)), (name, error, errors[1][name])
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")
+@pytest.mark.parametrize(("render_mode", "max_off_axis"), [("RGB", 0.0), ("RGB+ED", 0.0), ("RGB", 0.7)])
+def test_rasterization_equals_gsplats_own(monkeypatch, render_mode, max_off_axis):
+    monkeypatch.setattr(backend_gsplat, "TILE_SIZE", kernels.TILE_SIZE)  # gsplat 1.4 cuts off at borders of tiles
+    scene = {name: value.float().cuda() for name, value in random_scene(3000, 128, seed=0).items()}
+    del scene["weights"]
+    shared = {"width": 128, "height": 128, "sh_degree": 3, "render_mode": render_mode, "absgrad": False}
+    images = [rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="triton")]
+    images.append(rasterization(**scene, **shared, max_off_axis=max_off_axis, backend="gsplat"))
+    if max_off_axis == 0:
+        images.append(gsplat.rasterization(**scene, **shared, packed=False, tile_size=kernels.TILE_SIZE))
+    (renders, alphas, _), *others = images
+    # Rounding decides whether a Gaussian is drawn where its alpha is 1/255.
+    for expected, expected_alphas, _ in others:
+        for one, other in ((renders, expected), (alphas, expected_alphas)):
+            different = (one - other).abs() > 1e-5 * (1 + other.abs())
+            assert different.float().mean() < 1e-3

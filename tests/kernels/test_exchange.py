@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.distributed import exchange
 from sadgs_ns.render.types import Projected
 
@@ -17,7 +19,7 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 @pytest.mark.parametrize("number", [0, 1, 70, 200])
 def test_rows_are_torchs_and_give_the_gaussians_back(per_axis_radii: bool, number: int):
     """70 rows end within a program's, and with 200 of 100 places some are sent twice."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     shapes = [(2, 50, 2), (2, 50), (2, 50, 3), (2, 50), (2, 50, 3)]
     means2d, depths, conics, opacities, colors = (torch.randn(shape, generator=generator) for shape in shapes)
     radii = torch.randint(0, 5000, (2, 50, 2) if per_axis_radii else (2, 50), generator=generator, dtype=torch.int32)
@@ -30,7 +32,7 @@ def test_rows_are_torchs_and_give_the_gaussians_back(per_axis_radii: bool, numbe
         for name, value, expected in zip(Projected._fields[:6], taken, exchange.unpack(rows, top), strict=True):
             assert value.is_contiguous(), name
             assert value.dtype == expected.dtype, name
-            torch.testing.assert_close(value, expected, rtol=0, atol=0)
+            assert_close(value, expected, rtol=0, atol=0)
     taken = kernels.unpack(rows, 0)
     for value, whole in zip(taken, projected, strict=True):
         assert torch.equal(value[0], whole.flatten(0, 1)[places])

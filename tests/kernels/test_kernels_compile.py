@@ -79,7 +79,7 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
     assert run.returncode == 0, run.stderr[-3000:]
     expected = {"_similarity", "_gradient", "_count", "_list", "_observe"}
     expected |= {"_forward", "_backward", "_update", "_correlate", "_differentiate", "_aggregate", "_write_one"}
-    expected |= {"_composite_backward", "_composite_forward", "_quantize", "_accumulate_gradients", "_finish", "_order"}
+    expected |= {"_composite_backward", "_composite_forward", "_accumulate_gradients", "_finish", "_order"}
     expected |= {
         "_list_parts",
         "_pack",
@@ -88,8 +88,6 @@ def test_every_kernel_compiles_for_an_a100_and_an_h200(tmp_path):
         "_activate_backward",
         "_project_backward",
         "_project_forward",
-        "_correct",
-        "_correct_backward",
         "_correct_poses",
         "_correct_poses_backward",
         "_move_rows",

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import backend_torch
 from sadgs_ns.render.types import Cameras, Gaussians, Projected, RenderOptions
@@ -25,7 +27,7 @@ OPTIONS = RenderOptions(sh_degree=3, near_plane=0.2)
 
 def scene(num_views: int) -> dict[str, Tensor]:
     """Gaussians before, beside and behind cameras, with harmonics; float64 values that float32 holds."""
-    generator = torch.Generator().manual_seed(3)
+    generator = seeded(3)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -63,7 +65,7 @@ def project(backend: Any, leaves: dict[str, Tensor]) -> Projected:
 
 def differentiate(projected: Projected, seen: Tensor, names: tuple[str, ...]) -> None:
     """Call backward with gradients of some outputs, 0 where no backend draws."""
-    generator = torch.Generator().manual_seed(4)
+    generator = seeded(4)
     outputs = []
     gradients = []
     for name in OUTPUTS:
@@ -134,7 +136,7 @@ def test_projection_s_gradients_by_each_entry_of_a_matrix_equal_float64_autograd
     assert gradient is not None
     assert not gradient[:, 3].any()
     actual = gradient.double().cpu()
-    torch.testing.assert_close(actual, reference, rtol=1e-4, atol=2e-5 * float(reference.abs().max()))
+    assert_close(actual, reference, rtol=1e-4, atol=2e-5 * float(reference.abs().max()))
 
 
 def test_other_gradients_do_not_depend_on_whether_cameras_have_one():
@@ -152,7 +154,7 @@ def test_other_gradients_do_not_depend_on_whether_cameras_have_one():
         assert without[name].grad is not None
         actual = without[name].grad
         expected = having[name].grad
-        torch.testing.assert_close(actual, expected, rtol=1e-6, atol=1e-6)
+        assert_close(actual, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_what_is_not_drawn_moves_no_camera_whatever_its_numbers_are():
@@ -175,4 +177,4 @@ def test_what_is_not_drawn_moves_no_camera_whatever_its_numbers_are():
         gradients.append(leaves["viewmats"].grad)
     assert gradients[0] is not None
     assert gradients[0].abs().sum() > 0
-    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-5, atol=1e-5)
+    assert_close(gradients[1], gradients[0], rtol=1e-5, atol=1e-5)

@@ -10,7 +10,9 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from helpers.random_gaussians import nearly_aligned_viewmats
 from sadgs_ns import gsplat_compat
 
@@ -25,7 +27,7 @@ OUTPUTS = ("means2d", "depths", "conics", "passed")
 
 def scene(num_views: int) -> dict[str, Any]:
     """N Gaussians, of which some are beside and some behind the cameras, in float64."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -70,7 +72,7 @@ def gradients_of(
 
 def upstream_of(seen: Tensor, names: tuple[str, ...]) -> dict[str, Tensor]:
     """Gradients of the outputs, 0 where a Gaussian was not drawn; two are parts of rows, as compositing makes them."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     rows = torch.randn((*seen.shape, 12), generator=generator, dtype=torch.float64) * seen[..., None]
     passed = torch.randn((N, 3), generator=generator, dtype=torch.float64)
     every = {
@@ -137,7 +139,8 @@ def test_what_no_view_draws_has_gradients_of_zero_whatever_its_numbers_are():
     for name, value in results[1].items():
         assert not value[:50].any()
         assert value[50:].any()
-        torch.testing.assert_close(value, results[0][name])
+        expected = results[0][name]
+        assert_close(value, expected)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from helpers import gsplat_stub
+from helpers.closeness import assert_within_share
+from helpers.generators import seeded
 from helpers.random_gaussians import nearly_aligned_viewmats
 from sadgs_ns import gsplat_compat
 from sadgs_ns.render import backend_torch
@@ -28,7 +30,7 @@ Scene = dict[str, Tensor]
 
 def random_scene(num_views: int) -> Scene:
     """N Gaussians of all forms; some are faint, beside, behind or too near to the cameras. In float64."""
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(shape, generator=generator, dtype=torch.float64)
@@ -234,7 +236,7 @@ def test_what_has_no_finite_projection_is_not_drawn(value: str, per_axis_radii: 
 )
 def test_what_is_drawn_is_finite(per_axis_radii: bool, monkeypatch: Any):
     use_layout(monkeypatch, per_axis_radii)
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
 
     def numbers(*shape: int) -> Tensor:
         exponents = 38 * (2 * torch.rand(shape, generator=generator) - 1)
@@ -261,7 +263,7 @@ def test_scales_of_zero_leave_the_blur():
     assert (radii > 0).all()
     blur = 1 / gsplat_compat.SCREEN_BLUR
     expected = torch.tensor([blur, 0.0, blur]).expand(1, 2, 3)
-    torch.testing.assert_close(conics, expected, rtol=1e-6, atol=0)
+    assert_within_share(conics, expected, 1e-6)
 
 
 @pytest.mark.hard_case("a Gaussian behind, at and before the near plane", "it is drawn from the near plane on")
@@ -286,7 +288,8 @@ def test_no_gaussians_have_no_rows(per_axis_radii: bool, monkeypatch: Any):
     radii, *found = by_the_kernel(scene, WIDTH, HEIGHT)
     assert radii.shape == ((2, 0, 2) if per_axis_radii else (2, 0))
     expected = [(2, 0, 2), (2, 0), (2, 0, 3)]
-    assert [output.shape for output in found] == expected
+    shapes = [output.shape for output in found]
+    assert shapes == expected
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat's kernels need CUDA")

@@ -8,7 +8,10 @@ import pytest
 import torch
 from gsplat.cuda._torch_impl import _persp_proj, _quat_scale_to_covar_preci, _world_to_cam
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within, assert_within_share
+from helpers.generators import seeded
 from helpers.small_scenes import camera, random_params
 from sadgs_ns.gsplat_compat import SCREEN_BLUR
 from sadgs_ns.method.eta import (
@@ -73,7 +76,7 @@ def test_projected_axes_are_the_derivative_of_the_projection():
         means = params["means"].detach()
         moved = (project(means + tip) - project(means - tip)) / (2 * step)
         actual = axes[:, k]
-        torch.testing.assert_close(actual, moved, rtol=1e-6, atol=1e-7)
+        assert_close(actual, moved, rtol=1e-6, atol=1e-7)
 
 
 def test_projected_axes_span_gsplat_s_2d_covariance():
@@ -90,16 +93,16 @@ def test_projected_axes_span_gsplat_s_2d_covariance():
     means_c, covars_c = _world_to_cam(params["means"].detach(), covars, viewmats[:1])
     _, expected = _persp_proj(means_c, covars_c, Ks[:1], WIDTH, HEIGHT)
     actual = axes.transpose(1, 2) @ axes
-    torch.testing.assert_close(actual, expected[0], rtol=1e-9, atol=1e-9)
+    assert_close(actual, expected[0], rtol=1e-9, atol=1e-9)
 
 
 def test_principal_eigenvalue_is_torch_s():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     a = torch.rand((100, 2, 2), generator=generator, dtype=torch.float64)
     matrix = a @ a.mT
     packed = torch.stack([matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]], -1)
     expected = torch.linalg.eigvalsh(matrix)[:, 1]
-    torch.testing.assert_close(principal_eigenvalue(packed), expected)
+    assert_close(principal_eigenvalue(packed), expected)
 
 
 @pytest.mark.parametrize("difference", [0.0, 1e-12, 1e-7, 1e-4])
@@ -123,13 +126,13 @@ def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
     points = sample_footprint(
         torch.tensor([20.0, 30.0]).expand(200_000, 2),
         conics,
-        torch.rand((200_000, 2), generator=torch.Generator().manual_seed(0)),
+        torch.rand((200_000, 2), generator=seeded(0)),
     )
     actual = points.mean(0)
     expected = torch.tensor([20.0, 30.0])
-    torch.testing.assert_close(actual, expected, rtol=0, atol=0.03)
+    assert_within(actual, expected, 0.03)
     actual = points.T.cov()
-    torch.testing.assert_close(actual, covariance, rtol=0.02, atol=0.05)
+    assert_close(actual, covariance, rtol=0.02, atol=0.05)
     offset = points - torch.tensor([20.0, 30.0])
     distance = (offset @ torch.linalg.inv(covariance) * offset).sum(-1)
     assert distance.max() <= 4.001, "uniform in the 2σ ellipse, nothing outside"
@@ -137,7 +140,7 @@ def test_footprint_samples_have_the_gaussian_s_mean_and_covariance():
 
 def test_footprint_of_a_gaussian_thinner_than_the_blur_is_a_line_or_a_point():
     conics = torch.tensor([[1 / (4.0 + SCREEN_BLUR), 0.0, 1 / SCREEN_BLUR], [1 / SCREEN_BLUR, 0.0, 1 / SCREEN_BLUR]])
-    points = sample_footprint(torch.zeros(2, 2), conics, torch.rand((2, 2), generator=torch.Generator().manual_seed(0)))
+    points = sample_footprint(torch.zeros(2, 2), conics, torch.rand((2, 2), generator=seeded(0)))
     assert points.isfinite().all()
     assert abs(points[0, 1]) < 1e-2
     assert points[1].abs().max() < 1e-2
@@ -179,12 +182,12 @@ def test_eta_equals_the_brute_force_footprint_average():
     inverse = torch.linalg.inv(covariance + SCREEN_BLUR * torch.eye(2))
     n = 40_000
     conics = torch.stack([inverse[0, 0], inverse[0, 1], inverse[1, 1]]).expand(n, 3)
-    points = sample_footprint(mean.expand(n, 2), conics, torch.rand((n, 2), generator=torch.Generator().manual_seed(1)))
+    points = sample_footprint(mean.expand(n, 2), conics, torch.rand((n, 2), generator=seeded(1)))
     sampled, inside = sample_map(tensors, torch.zeros(n, dtype=torch.long), points)
     assert inside.all()
     axes = torch.tensor([[[3.0, 0.0], [0.0, 4.0], [1.0, 1.0]]])
     actual = eta(axes, sampled.mean(0)[None])
-    torch.testing.assert_close(actual, eta(axes, expected[None]), rtol=0.02, atol=0)
+    assert_within_share(actual, eta(axes, expected[None]), 0.02)
 
 
 def test_eta_compares_the_axis_with_the_wavelength():
@@ -193,4 +196,4 @@ def test_eta_compares_the_axis_with_the_wavelength():
     axes = torch.tensor([[[4.0, 0.0], [0.0, 4.0], [3.0, 4.0]]])
     actual = eta(axes, tensor)
     expected = torch.tensor([[2.0, 2.0, 2.5]])
-    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=0)
+    assert_within_share(actual, expected, 1e-4)

@@ -15,7 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within, assert_within_share
+from helpers.generators import seeded
 from sadgs_ns.method.eta import principal_eigenvalue, wavelength
 from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.training.model import SadgsModel
@@ -37,7 +40,7 @@ def grating(period: float, degrees: float = 0.0, size: int = 96) -> Tensor:
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed))
+    return torch.rand(shape, generator=seeded(seed))
 
 
 def central(tensor: Tensor) -> Tensor:
@@ -126,7 +129,7 @@ def test_texture_just_below_the_nyquist_frequency_is_seen():
 def test_amplitude_from_one_grey_level_to_hdr_changes_nothing(scale: float):
     image = noise(1, 40, 50, 3)
     actual = unit_tensor(scale * image)
-    torch.testing.assert_close(actual, unit_tensor(image), rtol=0, atol=1e-6)
+    assert_within(actual, unit_tensor(image), 1e-6)
 
 
 @pytest.mark.hard_case("two neighbouring grey levels of 8 bits", "the same S̄ as in black and white")
@@ -134,7 +137,7 @@ def test_one_grey_level_of_difference_is_a_texture():
     """An 8-bit image of only two neighbouring grey levels reads as the same pattern in black and white."""
     pattern = (grating(8.0) > 0.5).float()
     levels = (128 + pattern) / 255
-    torch.testing.assert_close(unit_tensor(levels), unit_tensor(pattern), rtol=0, atol=2e-3)
+    assert_within(unit_tensor(levels), unit_tensor(pattern), 2e-3)
 
 
 @pytest.mark.hard_case(
@@ -187,7 +190,7 @@ def test_images_of_any_size(height: int, width: int):
     tensor = unit_tensor(image)
     assert_sound(tensor)
     actual = unit_tensor(image.transpose(1, 2)).transpose(1, 2).flip(-1)
-    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-6)
+    assert_within(actual, tensor, 1e-6)
     assert height * width > 1 or tensor.eq(0).all()
 
 
@@ -197,7 +200,7 @@ def test_a_single_row_reads_a_grating_as_a_whole_image_does():
     row = unit_tensor(grating(9.0, size=192)[:, 96:97])[..., 60:130, :]
     assert row[..., 1:].abs().max() < 1e-6
     actual = row[..., 0]
-    torch.testing.assert_close(actual, whole, rtol=1e-4, atol=0)
+    assert_within_share(actual, whole, 1e-4)
 
 
 @pytest.mark.hard_case("a mask with 0, 1 or 2 distant valid pixels", "S̄ = 0 there, NaN at masked pixels")
@@ -220,7 +223,7 @@ def test_what_lies_under_a_mask_does_not_matter(value: float):
     painted = torch.where(mask[..., None], image, value)
     expected = unit_tensor(image, mask)
     actual = unit_tensor(painted, mask)
-    torch.testing.assert_close(actual, expected, rtol=0, atol=0, equal_nan=True)
+    assert_close(actual, expected, rtol=0, atol=0, equal_nan=True)
     assert_sound(expected, mask)
 
 
@@ -338,10 +341,10 @@ def test_flips_and_quarter_turns_are_exact(height: int, width: int, masked: bool
     tensor = unit_tensor(image, mask)
     for axis in (1, 2):
         flipped = unit_tensor(image.flip(axis), mask.flip(axis)).flip(axis)
-        torch.testing.assert_close(flipped * SIGNS, tensor, rtol=0, atol=1e-12, equal_nan=True)
+        assert_close(flipped * SIGNS, tensor, rtol=0, atol=1e-12, equal_nan=True)
     turned = unit_tensor(image.rot90(1, (1, 2)), mask.rot90(1, (1, 2))).rot90(-1, (1, 2))
     actual = turned.flip(-1) * SIGNS
-    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-12, equal_nan=True)
+    assert_close(actual, tensor, rtol=0, atol=1e-12, equal_nan=True)
 
 
 # --- nearly isotropic tensors ---

@@ -23,8 +23,11 @@ import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from torch import Tensor
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import configure, is_finite
 from helpers.small_scenes import CHECKER_SIZE, adam, camera, random_params, train_on_checker
@@ -110,7 +113,7 @@ def test_all_violate_beyond_measure_and_fill_the_cap(eta_max: float):
         assert p.isfinite().all()
     actual = params["scales"][47:].amin()
     expected = before["scales"][:3].amin() - math.log(8 / 1.5)
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     assert not any(value.any() for value in state.values() if isinstance(value, Tensor))
 
 
@@ -152,7 +155,7 @@ def test_a_parent_that_does_not_fit_does_not_block_the_smaller_ones():
     "each parent is taken, in the order of η, that fits into the room which those before it left over",
 )
 def test_growth_is_chosen_one_by_one_from_the_largest_violation():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     sizes = torch.tensor([0, 1, 2, 3, 7, 26, 63, 511])
     for budget in [-3, 0, 1, 5, 50, 512, 700, 3000, 10**6]:
         growth = sizes[torch.randint(0, 8, (200,), generator=generator)]
@@ -170,7 +173,8 @@ def test_growth_is_chosen_one_by_one_from_the_largest_violation():
 def test_a_cap_under_the_initial_number_stops_growth_only():
     params = random_params(30)
     start = params["means"].detach().clone()
-    assert train(short(max_gaussians=20), params) == [30] * 22
+    actual = train(short(max_gaussians=20), params)
+    assert actual == [30] * 22
     assert not torch.equal(params["means"], start)
     for p in params.values():
         assert p.isfinite().all()
@@ -358,19 +362,14 @@ def test_opacities_of_exactly_zero_and_one():
     assert finite_or_infinite_logits(params)
     opacities = torch.sigmoid(params["opacities"].detach())
     expected = strategy_module.CLAMP_OPACITY * (logits > 0)
-    torch.testing.assert_close(opacities, expected, atol=0.01, rtol=0)
+    assert_within(opacities, expected, 0.01)
 
     params["opacities"].data = logits.clone()
     numbers = train(short(absgs_every=0, tau_split=1.0, min_opacity=0.005, reset_every=11), params, 11)
     assert numbers[-1] == 6, "those of opacity 0 are pruned"
     assert params["opacities"].isfinite().all()
     actual = torch.sigmoid(params["opacities"].detach())
-    torch.testing.assert_close(
-        actual,
-        torch.full((6,), 0.1 * strategy_module.CLAMP_OPACITY),
-        atol=0.01,
-        rtol=0,
-    )
+    assert_within(actual, torch.full((6,), 0.1 * strategy_module.CLAMP_OPACITY), 0.01)
 
 
 # --- initial points ---
@@ -480,7 +479,7 @@ def test_a_gradient_just_under_the_bound_keeps_adam_finite():
     for value in optimizer.state[parameter].values():
         assert value.isfinite().all()
     expected = torch.tensor([-0.01, 0.01])
-    torch.testing.assert_close(parameter.detach(), expected)
+    assert_close(parameter.detach(), expected)
 
 
 @pytest.mark.hard_case(
@@ -499,7 +498,7 @@ def test_absgs_sums_skip_what_is_no_number_and_ignore_what_overflowed():
     assert gradients["grad2d"].isfinite().tolist() == [True, True, False, True]
     actual = gradients["grad2d"][1]
     expected = gradients["grad2d"][0] / 2
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     params = random_params(4)
     state = {**gradients, "scene_scale": 1e4}  # all are small
     proposal = absgs(StructureAwareStrategy(clone_grad2d=1e-6, split_absgrad2d=1e-6), params, state)
@@ -671,4 +670,5 @@ def test_the_log_is_read_before_it_overflows(
         data["image"] = torch.full(image.shape, math.nan)
     with pytest.raises(RunError, match=r"^Nothing was learned in the last 5 iterations, .*: the loss was nan \(images"):
         trainer.train()
-    assert capsys.readouterr().out.count("the loss was nan") == 5
+    printed = capsys.readouterr().out
+    assert printed.count("the loss was nan") == 5

@@ -6,12 +6,14 @@ import math
 
 import torch
 from pytorch_msssim import ssim
+from torch.testing import assert_close
 
+from helpers.generators import seeded
 from sadgs_ns.method.losses import photometric_loss
 
 
 def images(*shape: int) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     target = torch.rand(shape, generator=generator, dtype=torch.float64)
     return target + 0.1 * torch.randn(shape, generator=generator, dtype=torch.float64), target
 
@@ -23,8 +25,8 @@ def test_loss_is_the_stated_sum():
     l1 = (predicted - target).abs().mean()
     l2 = (predicted - target).square().mean()
     expected = 0.7 * l1 + 0.3 * (1 - similarity) + 1.5 * l2
-    torch.testing.assert_close(loss, expected)
-    torch.testing.assert_close(psnr, 10 * torch.log10(1 / l2))
+    assert_close(loss, expected)
+    assert_close(psnr, 10 * torch.log10(1 / l2))
 
 
 def test_equal_images_cost_nothing():

@@ -80,7 +80,8 @@ def test_gaussians_are_left_out_where_each_view_is_rendered_often(num_views: int
 
 
 def test_a_run_of_a_few_iterations_leaves_nothing_out():
-    assert dropout(Schedule(5, 1), 100) == 0
+    actual = dropout(Schedule(5, 1), 100)
+    assert actual == 0
 
 
 def test_what_is_set_by_hand_stays():

@@ -7,7 +7,10 @@ import math
 import pytest
 import torch
 from gsplat.utils import normalized_quat_to_rotmat
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within_share
+from helpers.generators import seeded
 from helpers.small_scenes import adam, camera, random_params, splat
 from sadgs_ns.distributed.ranking import limit_growth
 from sadgs_ns.distributed.world import World
@@ -53,7 +56,7 @@ def test_budget_goes_to_the_largest_violations():
 
 
 def test_the_cap_is_never_exceeded():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     for budget in range(0, 400, 7):
         growth = torch.randint(0, 60, (50,), generator=generator)
         chosen = limit_growth(World(), growth, torch.rand(50, generator=generator), budget)
@@ -64,10 +67,10 @@ def test_grid_is_centred_and_its_variance_completes_the_child_s():
     parents, grid = grid_offsets(torch.tensor([[1, 2, 3], [4, 1, 1]]))
     assert parents.tolist() == [0] * 6 + [1] * 4
     actual = grid[:6].mean(0)
-    torch.testing.assert_close(actual, torch.zeros(3))
+    assert_close(actual, torch.zeros(3))
     expected = torch.tensor([0.0, 1 - 1 / 4, 1 - 1 / 9])  # plus 1/n² of the child itself is 1
     actual = grid[:6].square().mean(0)
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     spacing = grid[7, 0] - grid[6, 0]
     assert float(spacing) == pytest.approx(math.sqrt(12) / 4)
 
@@ -89,19 +92,19 @@ def test_split_keeps_the_parent_s_mean_and_covariance(counts: list[int], child_s
     offset = children["means"] - parent["means"]
     mixture = own.mean(0) + (offset.T @ offset) / len(offset)
     actual = children["means"].mean(0)
-    torch.testing.assert_close(actual, parent["means"], rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
+    assert_close(actual, parent["means"], rtol=1e-12, atol=1e-12)
+    assert_close(mixture, covariance, rtol=1e-10, atol=1e-14)
     for name in ("features_dc", "quats"):
         expected = parent[name].expand_as(children[name])
-        torch.testing.assert_close(children[name], expected)
+        assert_close(children[name], expected)
     if child_scale == 1:  # the paper's are as opaque as the parent
         expected = parent["opacities"].expand_as(children["opacities"])
-        torch.testing.assert_close(children["opacities"], expected)
+        assert_close(children["opacities"], expected)
     # And the integral of opacity: opacity times the product of scales.
     mass = [torch.sigmoid(p["opacities"].flatten()) * p["scales"].exp().prod(dim=-1) for p in (parent, children)]
     actual = mass[1].sum()
     expected = mass[0].sum()
-    torch.testing.assert_close(actual, expected, rtol=1e-12, atol=0)
+    assert_within_share(actual, expected, 1e-12)
 
 
 @pytest.mark.hard_case(
@@ -188,4 +191,4 @@ def test_optimizer_state_and_statistics_follow():
         assert not slots["exp_avg"][3:].any()
         assert float(slots["step"]) == 1
     actual = optimizers["means"].state[params["means"]]["exp_avg"][:3]
-    torch.testing.assert_close(actual, moments[kept])
+    assert_close(actual, moments[kept])

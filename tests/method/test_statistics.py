@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch.testing import assert_close
 
 from helpers.small_scenes import camera, random_params, splat
 from sadgs_ns.method import statistics as statistics_of_eta
@@ -57,7 +58,7 @@ def test_counts_by_hand(per_axis_radii: bool):
     assert statistics["n_low"][0].tolist() == [0.0, 0.0, n]
     actual = statistics["eta_max"][0]
     expected = torch.tensor([15.0, 1.5, 0.0])
-    torch.testing.assert_close(actual, expected, rtol=1e-3, atol=1e-3)
+    assert_close(actual, expected, rtol=1e-3, atol=1e-3)
     for key in ("n_total", "n_high", "n_low", "eta_max"):
         assert not statistics[key][1:].any(), "the unseen have no statistics"
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 from gsplat.strategy.base import Strategy
+from torch.testing import assert_close
 
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns.method import budget, growth
@@ -337,7 +338,7 @@ def test_opacity_schedule(monkeypatch: pytest.MonkeyPatch):
 
     plain = opacities()
     reset = opacities(reset_every=20, refine_stop_iter=30)
-    torch.testing.assert_close(reset, 0.1 * plain, rtol=1e-4, atol=1e-5)
+    assert_close(reset, 0.1 * plain, rtol=1e-4, atol=1e-5)
     monkeypatch.setattr(strategy_module, "CLAMP_OPACITY", 0.5)
     clamped, _, _ = train(short(absgs_every=0, tau_split=1.0), 10)
     assert torch.sigmoid(clamped["opacities"]).max() <= 0.5 + 1e-6
@@ -347,7 +348,7 @@ def test_no_reset_so_late_that_the_final_prune_takes_everything():
     """1,900 iterations end densification at 1203: a reset at 1200 would leave no time to recover."""
     late, _, _ = train(short(absgs_every=0, structure_every=0, reset_every=20, refine_stop_iter=21), 20)
     plain, _, _ = train(short(absgs_every=0, structure_every=0), 20)
-    torch.testing.assert_close(late["opacities"], plain["opacities"])
+    assert_close(late["opacities"], plain["opacities"])
 
 
 def test_statistics_end_with_densification():
@@ -404,7 +405,8 @@ def test_low_eta_and_low_opacity_together_prune(monkeypatch: pytest.MonkeyPatch)
     optimizers = adam(params, lr=0.0)
     keep = params["means"].detach()[1:].clone()
     short().for_run(3000).densify(params, optimizers, state, 9, [])
-    torch.testing.assert_close(params["means"].detach(), keep)
+    actual = params["means"].detach()
+    assert_close(actual, keep)
 
 
 def test_pruning_never_leaves_nothing():
@@ -440,7 +442,7 @@ def test_absgs_clones_on_the_mean_and_splits_on_the_absolute_gradient():
     scales = params["scales"].exp()[:, 0]
     actual = scales.sort().values
     expected = torch.tensor([0.05, 0.05, 0.05, 0.3125, 0.3125, 0.5])
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
 
 
 def test_absgs_halves_the_longest_axis_in_its_place():
@@ -455,14 +457,14 @@ def test_absgs_halves_the_longest_axis_in_its_place():
     axes = torch.tensor([[0.0, 0, 1], [1, 0, 0]])
     actual = children["scales"].exp()
     expected = (parents["scales"].exp() * (0.8 - 0.3 * axes))[:, None].repeat(1, 2, 1)
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     actual = children["means"].mean(dim=1)
-    torch.testing.assert_close(actual, parents["means"])
+    assert_close(actual, parents["means"])
     offset = (children["means"][:, 1] - children["means"][:, 0]) / 2
-    torch.testing.assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
+    assert_close(offset.abs(), axes * parents["scales"].exp() * 0.75**0.5)  # which keeps the covariance
     for name in ("quats", "opacities", "features_dc"):
         expected = parents[name][:, None].expand_as(children[name])
-        torch.testing.assert_close(children[name], expected)
+        assert_close(children[name], expected)
 
 
 @pytest.mark.hard_case(
@@ -476,7 +478,8 @@ def test_absgs_leaves_statistics_with_the_gaussians_that_were_observed(long_axis
     state = gradient_state([3e-4, 0.0, 0.0], [0.0, 9e-4, 1e-4]) | empty_statistics(3, torch.device("cpu"))
     for name in ("n_high", "eta_max", "n_total"):
         state[name] += torch.tensor([1.0, 20.0, 3.0]).view(3, *[1] * (state[name].dim() - 1))
-    assert grow_with(params, state, long_axis=long_axis) == (1, 1)
+    actual = grow_with(params, state, long_axis=long_axis)
+    assert actual == (1, 1)
     assert state["n_total"].tolist() == [1, 3, 0, 0, 0], "the cloned, the one left whole, the clone, two children"
     for name in ("n_high", "n_low", "eta_max"):
         assert not state[name][2:].any()
@@ -490,7 +493,7 @@ def test_absgs_spends_a_budget_on_the_steepest():
     actual = grow_with(params, gradient_state([3e-4, 9e-4, 4e-4], [0.0] * 3), budget=1)
     assert actual == (1, 0)
     actual = params["means"].detach()[3]
-    torch.testing.assert_close(actual, means[1])
+    assert_close(actual, means[1])
 
 
 def test_gradients_are_normalised_as_in_3dgs():
@@ -502,9 +505,9 @@ def test_gradients_are_normalised_as_in_3dgs():
     gradients = empty_gradients(3, torch.device("cpu"))
     accumulate_gradients(gradients, info, num_views=2)
     expected = torch.tensor([5.0, 10.0, 0.0])
-    torch.testing.assert_close(gradients["grad2d"], expected)
+    assert_close(gradients["grad2d"], expected)
     expected = torch.tensor([10.0, 20.0, 0.0])
-    torch.testing.assert_close(gradients["absgrad2d"], expected)
+    assert_close(gradients["absgrad2d"], expected)
     assert gradients["grad_count"].tolist() == [1, 2, 0]
 
 

@@ -9,7 +9,10 @@ import pytest
 import torch
 from scipy import ndimage
 from torch import Tensor
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from sadgs_ns.method.eta import wavelength
 from sadgs_ns.method.structure_tensor import NOISE_FLOOR, NUM_LEVELS, gaussian_kernel, multiscale_structure_tensor
 
@@ -73,7 +76,7 @@ def reference_structure_tensor(
 
 @pytest.mark.parametrize("epsilon", [None, 1e-6, 1e-2])
 def test_agrees_with_the_float64_reference_in_the_interior(epsilon: float | None):
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     image = torch.rand((160, 170, 3), generator=generator, dtype=torch.float64)
     image = image + grating(9.0, 0.4, 170)[0, :160].double()  # texture over noise
     image = 0.7 * image  # the brightest value is not 1
@@ -82,7 +85,7 @@ def test_agrees_with_the_float64_reference_in_the_interior(epsilon: float | None
     for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-5)):
         # The reference does not centre the image, so its own contrast is used for both.
         actual = unit_tensor(image[None].to(dtype), epsilon=epsilon)[0].double()
-        torch.testing.assert_close(actual[interior], expected[interior], rtol=tolerance, atol=tolerance)
+        assert_close(actual[interior], expected[interior], rtol=tolerance, atol=tolerance)
 
 
 def test_an_absolute_epsilon_makes_the_wavelength_depend_on_contrast():
@@ -142,12 +145,12 @@ def test_channels_are_summed_after_di_zenzo():
     image[..., 1] = 1 - image[..., 0]
     image[..., 2] = 0.5
     grey = unit_tensor(grating(8.0))
-    torch.testing.assert_close(unit_tensor(image), grey, rtol=1e-3, atol=1e-4)
+    assert_close(unit_tensor(image), grey, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("amplitude", [0.5, 0.05, 0.01])
 def test_exposure_changes_less_than_the_supplement_allows(amplitude: float):
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     texture = grating(7.0, 0.3, amplitude=1.0, offset=0.0) + grating(19.0, 1.2, amplitude=1.0, offset=0.0)
     texture = texture + 0.2 * torch.randn(texture.shape, generator=generator)
     image = 0.5 + amplitude * texture / texture.abs().max()
@@ -171,7 +174,7 @@ def test_a_constant_image_has_no_structure():
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (2, 3), (9, 40), (33, 15)])
 def test_images_smaller_than_the_kernels(size: tuple[int, int]):
-    image = torch.rand((2, *size, 3), generator=torch.Generator().manual_seed(2))
+    image = torch.rand((2, *size, 3), generator=seeded(2))
     tensor = unit_tensor(image)
     xx, xy, yy = tensor.unbind(-1)
     assert tensor.shape == (2, *size, 3)
@@ -188,14 +191,14 @@ def test_the_border_adds_no_structure():
 
 
 def test_flips_and_quarter_turns_are_exact():
-    image = torch.rand((1, 37, 52, 3), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    image = torch.rand((1, 37, 52, 3), generator=seeded(3), dtype=torch.float64)
     tensor = unit_tensor(image)
     flipped = unit_tensor(image.flip(2)).flip(2)
     actual = flipped * torch.tensor([1.0, -1.0, 1.0])
-    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-12)
+    assert_within(actual, tensor, 1e-12)
     turned = unit_tensor(image.rot90(1, (1, 2))).rot90(-1, (1, 2))
     actual = turned.flip(-1) * torch.tensor([1.0, -1.0, 1.0])
-    torch.testing.assert_close(actual, tensor, rtol=0, atol=1e-12)
+    assert_within(actual, tensor, 1e-12)
 
 
 def test_a_mask_makes_no_edge_and_no_difference_far_from_it():
@@ -206,7 +209,7 @@ def test_a_mask_makes_no_edge_and_no_difference_far_from_it():
     painted = torch.where(mask[..., None], image, 0.0)
     masked = unit_tensor(painted, mask)
     expected = unit_tensor(image, mask)
-    torch.testing.assert_close(masked, expected, rtol=0, atol=0, equal_nan=True)
+    assert_close(masked, expected, rtol=0, atol=0, equal_nan=True)
     assert masked[~mask].isnan().all()
     assert masked[mask].isfinite().all()
     plain = unit_tensor(image)
@@ -217,14 +220,14 @@ def test_a_mask_makes_no_edge_and_no_difference_far_from_it():
 
 
 def test_batch_equals_one_by_one_and_a_full_mask_equals_none():
-    images = torch.rand((3, 30, 41, 3), generator=torch.Generator().manual_seed(4))
+    images = torch.rand((3, 30, 41, 3), generator=seeded(4))
     batch = unit_tensor(images)
     for image, tensor in zip(images, batch, strict=True):
         actual = unit_tensor(image[None])[0]
-        torch.testing.assert_close(actual, tensor, rtol=1e-5, atol=1e-6)
+        assert_close(actual, tensor, rtol=1e-5, atol=1e-6)
     full = torch.ones(images.shape[:3], dtype=torch.bool)
     actual = unit_tensor(images, full)
-    torch.testing.assert_close(actual, batch, rtol=1e-4, atol=1e-5)
+    assert_close(actual, batch, rtol=1e-4, atol=1e-5)
 
 
 def test_energy_window_removes_the_zero_crossings_of_eq_4():

@@ -138,7 +138,7 @@ def test_photos_that_cannot_be_placed_again_are_not_judged_by_that(model: pycolm
 
 
 def test_the_disagreement_reaches_the_summary(placed: Path, model: pycolmap.Reconstruction):
-    assert float((placed / "model" / "disagreement.txt").read_text()) < 0.02
+    assert float((placed / "model/disagreement.txt").read_text()) < 0.02
     names = [image.name for image in model.images.values()]
     database = placed / "database.db"
     assert not reconstruct.summarize(names, model, database, "exhaustive", "", 0.015).doubts
@@ -155,7 +155,7 @@ def test_a_firm_model_is_placed_once(placed: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.delattr(reconstruct._Search, "place_again")
     names = [f"{i:02d}.png" for i in range(VIEWS)]
     reconstruct.place_cameras(placed / "photos", names, tmp_path / "database.db", tmp_path / "model", None)
-    assert math.isnan(float((tmp_path / "model" / "disagreement.txt").read_text()))
+    assert math.isnan(float((tmp_path / "model/disagreement.txt").read_text()))
 
 
 def test_other_samples_verify_the_matches_in_a_copy(placed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from helpers.drawn_photos import draw_photos
+from helpers.json_files import write_json
 from sadgs_ns.placing.folder import look_into
 
 INFRARED = b'<rdf:Description drone-dji:ImageSource="InfraredCamera"/>'
@@ -201,26 +201,29 @@ def colours_in_names(folder: Path, i: int, photo: Image.Image) -> None:
 )
 def test_ordinary_photos_stay(shot: Draw, tmp_path: Path):
     names = draw(tmp_path, shot)
-    assert look_into(tmp_path, tmp_path / "out") == (names, {}, [])
+    actual = look_into(tmp_path, tmp_path / "out")
+    assert actual == (names, {}, [])
 
 
 def test_photos_that_a_scene_has_stay(tmp_path: Path):
     names = draw(tmp_path, thermal_drone)
     known = [name for name in names if "_T." in name][:2]
-    settings = tmp_path / "out" / "work" / "settings.json"
+    settings = tmp_path / "out/work/settings.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"photos": known}))
+    write_json(settings, {"photos": known})
     found, _, told = look_into(tmp_path, tmp_path / "out")
-    assert [name for name in found if "_T." in name] == known
+    actual = [name for name in found if "_T." in name]
+    assert actual == known
     assert told == [THERMAL.format(2, "DJI_20260501100003_0002_T.JPG")]
 
 
 def test_thermal_images_that_are_added_to_thermal_ones_stay(tmp_path: Path):
     names = draw(tmp_path, all_thermal)
-    settings = tmp_path / "out" / "work" / "settings.json"
+    settings = tmp_path / "out/work/settings.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"photos": names[:3]}))
-    assert look_into(tmp_path, tmp_path / "out") == (names, {}, [])
+    write_json(settings, {"photos": names[:3]})
+    actual = look_into(tmp_path, tmp_path / "out")
+    assert actual == (names, {}, [])
 
 
 def test_a_damaged_photo_among_bands_is_left_to_be_named(tmp_path: Path):

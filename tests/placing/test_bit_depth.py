@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import pytest
 from PIL import Image
 
 from helpers.drawn_photos import color_profile
+from helpers.json_files import read_json, write_json
 from sadgs_ns.cli.process import main
 from sadgs_ns.placing import place
 from sadgs_ns.placing.bit_depth import depth_of, read_scaled
@@ -82,7 +82,8 @@ def test_values_of_few_bits_are_scaled_by_the_largest_of_all_photos(
     photos = write(tmp_path / "photos", a=stored(0, 99, 150), b=stored(largest), c=stored(150, 99, 0))
     Image.fromarray(stored(150)[:, :, 0]).save(photos / "d.tif")
     Image.new("RGB", SIZE, (1, 2, 3)).save(photos / "e.png")
-    assert main([str(photos), str(tmp_path / "out")]) == 0
+    status = main([str(photos), str(tmp_path / "out")])
+    assert status == 0
     white = 2**depth - 1
     middle = round(255 * 150 / white)
     low = round(255 * 99 / white)
@@ -97,15 +98,18 @@ def test_values_of_few_bits_are_scaled_by_the_largest_of_all_photos(
         assert image.dtype == np.uint8
         assert image[:, 8:].max() <= 3
     told = f"4 photos of 16 bits use {depth} of them (largest value {largest:,}): {white:,} becomes white.\n"
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
 
 
 @pytest.mark.hard_case("photos whose values use all of 16 bits", "are read as they are, without a line")
 def test_photos_of_16_bits_are_taken_as_they_are(tmp_path: Path, taken: list[Taken], capsys):
     photos = write(tmp_path / "photos", a=stored(0, 99, 150), b=stored(16384), c=stored(1))
-    assert main([str(photos), str(tmp_path / "out")]) == 0
+    status = main([str(photos), str(tmp_path / "out")])
+    assert status == 0
     assert taken[0].unchanged == {"a.png", "b.png", "c.png"}
-    assert "photos of 16 bits" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "photos of 16 bits" not in printed
 
 
 @pytest.mark.hard_case(
@@ -129,7 +133,8 @@ def test_the_bits_that_were_chosen_first_stay(tmp_path: Path, taken: list[Taken]
     told = (
         "use 12 of them (largest value 60,000): 4,095 becomes white. The first photos of the scene decided this; 1 of"
     )
-    assert told in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert told in printed
     write(photos, f=stored(819, 0, 0))
     assert main(command) == 0
     assert left(taken[2].pixels["f.png"]) == [0, 0, 51]
@@ -146,10 +151,10 @@ def test_a_scene_of_an_earlier_version_is_as_dark_as_before(tmp_path: Path, take
     photos = write(tmp_path / "photos", a=stored(4095), b=stored(819), c=stored(1))
     command = [str(photos), str(tmp_path / "out")]
     assert main(command) == 0
-    settings = tmp_path / "out" / "work" / "settings.json"
-    described = json.loads(settings.read_text())
+    settings = tmp_path / "out/work/settings.json"
+    described = read_json(settings)
     assert described.pop("bit_depth") == 12
-    settings.write_text(json.dumps(described))
+    write_json(settings, described)
     write(photos, d=stored(0, 0, 819))
     assert main(command) == 0
     assert taken[1].unchanged == {"a.png", "b.png", "c.png", "d.png"}
@@ -164,7 +169,8 @@ def test_the_first_photos_of_16_bits_decide_also_if_they_are_added(tmp_path: Pat
     assert main(command) == 0
     write(photos, a=stored(4095), b=stored(819))
     assert main(command) == 0
-    assert left(taken[1].pixels["b.png"]) == [51, 51, 51]
+    actual = left(taken[1].pixels["b.png"])
+    assert actual == [51, 51, 51]
 
 
 @pytest.mark.parametrize("opaque", [65535, 4095])
@@ -185,7 +191,8 @@ def test_scaled_photos_are_turned_and_their_profile_is_used(tmp_path: Path, take
     Image.open(photos / "a.png").save(photos / "a.png", exif=exif)
     Image.fromarray(stored(4095)[:, :, 0]).save(photos / "d.tif", exif=exif, compression="tiff_lzw")
     with_profile(photos / "b.png", color_profile(swapped=True))
-    assert main([str(photos), str(tmp_path / "out")]) == 0
+    status = main([str(photos), str(tmp_path / "out")])
+    assert status == 0
     for name in ("a.png", "d.tif"):
         turned = taken[0].pixels[name]
         assert turned.shape == (12, 8, 3)

@@ -92,7 +92,8 @@ def test_photos_that_have_features_are_not_searched_again(features, tmp_path: Pa
     assert told[-1] == ("features", 4, 4)
     with features.pycolmap.Database.open(database) as opened:
         images = opened.read_all_images()
-        assert {image.name for image in images} == set(names)
+        actual = {image.name for image in images}
+        assert actual == set(names)
         assert len({image.camera_id for image in images}) == 1  # The photos of a group share one.
         for image in images:
             assert opened.num_keypoints_for_image(image.image_id) > 0

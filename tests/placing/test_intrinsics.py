@@ -37,7 +37,8 @@ def test_cameras_have_few_parameters_for_a_while_and_then_all_again(tmp_path: Pa
     database = tmp_path / "database.db"
     write_cameras(database)
     before = read_cameras(database)
-    assert [name for name, _, _ in before] == ["OPENCV", "OPENCV", "PINHOLE"]
+    actual = [name for name, _, _ in before]
+    assert actual == ["OPENCV", "OPENCV", "PINHOLE"]
     with pytest.raises(RuntimeError, match="stopped"), few_parameters(database, fixed_cameras={2}):
         within = read_cameras(database)
         raise RuntimeError("stopped")
@@ -52,7 +53,8 @@ def test_cameras_that_a_killed_run_left_with_few_parameters_get_all(tmp_path: Pa
     before = read_cameras(database)
     killed = few_parameters(database, fixed_cameras=())
     killed.__enter__()
-    assert [name for name, _, _ in read_cameras(database)] == ["SIMPLE_RADIAL", "SIMPLE_RADIAL", "PINHOLE"]
+    actual = [name for name, _, _ in read_cameras(database)]
+    assert actual == ["SIMPLE_RADIAL", "SIMPLE_RADIAL", "PINHOLE"]
     with few_parameters(database, fixed_cameras=()):
         pass
     assert read_cameras(database) == before

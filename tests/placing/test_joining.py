@@ -91,7 +91,7 @@ def test_folders_of_two_lenses_keep_two_cameras_and_one_that_is_added_finds_its_
     take_photos(source / "cam0", phases["cam0"], WIDTH)
     take_photos(source / "cam1", phases["cam1"], 1.25 * WIDTH)
     assert process(Process(source, out)).registered == 2 * COUNT
-    before = pycolmap.Reconstruction(out / "work" / "model")
+    before = pycolmap.Reconstruction(out / "work/model")
     cameras = camera_of_folders(before)
     assert len(set(cameras.values())) == 2
     for folder, factor in (("cam0", 1), ("cam1", 1.25)):
@@ -117,13 +117,14 @@ def test_folders_of_one_lens_have_one_camera_to_which_photos_are_added(tmp_path:
     take_photos(source / "cam1", 0.04, WIDTH)
     take_photos(later, 0.06, WIDTH)
     assert process(Process(source, out)).registered == 2 * COUNT
-    before = pycolmap.Reconstruction(out / "work" / "model")
+    before = pycolmap.Reconstruction(out / "work/model")
     assert len(before.cameras) == len(before.rigs) == 1
     assert before.is_valid()
     (camera,) = before.cameras.values()
     assert camera.mean_focal_length() == pytest.approx(WIDTH, rel=0.02)
-    with pycolmap.Database.open(out / "work" / "database.db") as database:
-        assert {image.camera_id for image in database.read_all_images()} == {camera.camera_id}
+    with pycolmap.Database.open(out / "work/database.db") as database:
+        camera_ids = {image.camera_id for image in database.read_all_images()}
+        assert camera_ids == {camera.camera_id}
 
     for name in ("03.png", "07.png"):
         shutil.move(later / name, source / "cam1" / f"added-{name}")

@@ -181,7 +181,8 @@ def test_matches_are_verified_as_by_colmap_bit_for_bit(
     has_matches = {pair_id: rows > 0 for pair_id, rows, *_ in rows_of(tmp_path / "ours.db", "matches")}
     of_matched = [row for row in ours if has_matches[row[0]]]  # COLMAP writes nothing of pairs without any.
     assert of_matched == rows_of(tmp_path / "colmap.db", "two_view_geometries")
-    assert sum(rows > 0 for _, rows, *_ in ours) == 3
+    actual = sum(rows > 0 for _, rows, *_ in ours)
+    assert actual == 3
     assert len(ours) == len(pairs) == 10, "those that failed have a row, too"
 
 
@@ -211,7 +212,8 @@ def test_pairs_that_were_interrupted_end_as_if_they_were_not(matching: ModuleTyp
     matching.write_matches(tmp_path / "parts.db", *arguments)
     assert len(matched) == 8 + 7, "neither are pairs that failed"
     for table in ("matches", "two_view_geometries"):
-        assert rows_of(tmp_path / "parts.db", table) == rows_of(tmp_path / "whole.db", table)
+        actual = rows_of(tmp_path / "parts.db", table)
+        assert actual == rows_of(tmp_path / "whole.db", table)
 
 
 def test_stored_matches_are_verified_again_without_geometries(matching: ModuleType, searched, tmp_path, monkeypatch):

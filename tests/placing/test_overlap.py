@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_array_equal
 
 from helpers.colmap_database import rows_of
 from helpers.drawn_photos import draw_photos
@@ -71,7 +72,7 @@ def test_each_pair_of_a_plan_is_matched_in_its_order(ahead: ModuleType):
     for one, other in pairs[:3]:
         expected = match_descriptors(*(torch.from_numpy(by_name[name].descriptors) for name in (one, other)))
         found = matches[by_name[one].image_id, by_name[other].image_id]
-        np.testing.assert_array_equal(found, expected.numpy())
+        assert_array_equal(found, expected.numpy())
     assert len(matches[1, 2]) >= 15
 
 
@@ -202,7 +203,7 @@ def test_images_are_undistorted_while_the_model_is_written_and_again_after_an_in
     writer: Future[ModuleType] = Future()
     writer.set_result(importlib.import_module("nerfstudio.process_data.colmap_utils"))
     monkeypatch.setattr(reconstruct, "begin_imports", lambda: (future_of(torch.device("cpu")), writer))
-    model = tmp_path / "work" / "model"
+    model = tmp_path / "work/model"
     model.parent.mkdir()
     had_model = []
     begin = Undistortion.begin
@@ -224,7 +225,8 @@ def test_images_are_undistorted_while_the_model_is_written_and_again_after_an_in
     assert had_model == [False, True]
     theirs = tmp_path / "theirs"
     theirs.mkdir()
-    writer.result().colmap_to_json(undistorted / "sparse" / "0", theirs)
+    writer.result().colmap_to_json(undistorted / "sparse/0", theirs)
     for file in ("transforms.json", "sparse_pc.ply"):
         assert (undistorted / file).read_bytes() == (theirs / file).read_bytes()
-    assert {file: (undistorted / file).read_bytes() for file in files} == written
+    actual = {file: (undistorted / file).read_bytes() for file in files}
+    assert actual == written

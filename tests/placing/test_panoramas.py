@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import shutil
 from collections import defaultdict
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 from PIL import Image
 
 from helpers.drawn_photos import draw_panorama, draw_photo, draw_photos, panorama_centres
+from helpers.json_files import read_json
 from sadgs_ns.cli.process import Process, main, process
 from sadgs_ns.placing.panoramas import VIEWS, cut, is_fisheye_pair, is_panorama, rotations
 from sadgs_ns.placing.photos import read_photos
@@ -76,7 +76,7 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
     assert summary.registered == 11 * VIEWS
     printed = capsys.readouterr().out
     assert "11 of the 11 photos are panoramas: each is cut into 8 views of 90°" in printed
-    described = json.loads((out / "transforms.json").read_text())
+    described = read_json(out / "transforms.json")
     assert described["val_filenames"] == described["test_filenames"] == [f"images/04.jpg/{i}.jpg" for i in range(VIEWS)]
     assert len(described["train_filenames"]) == 10 * VIEWS
     assert len(described["frames"]) == 11 * VIEWS
@@ -92,15 +92,16 @@ def test_panoramas_become_views_and_more_are_added(panoramas: list[Image.Image],
     summary = process(Process(source, out, matching="exhaustive"))
     assert summary.photos == COUNT * VIEWS + 2
     assert summary.registered == COUNT * VIEWS + 2
-    assert "12 of the 14 photos are panoramas" in capsys.readouterr().out
-    grown = json.loads((out / "transforms.json").read_text())
+    printed = capsys.readouterr().out
+    assert "12 of the 14 photos are panoramas" in printed
+    grown = read_json(out / "transforms.json")
     frames = {frame["file_path"]: frame for frame in grown["frames"]}
     assert all(frames[frame["file_path"]] == frame for frame in described["frames"])
     assert grown["test_filenames"] == described["test_filenames"]
     new = [f"images/11.jpg/{i}.jpg" for i in range(VIEWS)] + ["images/a.jpg", "images/b.jpg"]
     assert grown["train_filenames"] == described["train_filenames"] + new
     assert all((out / name).is_file() for name in frames)
-    assert errors_of_centres(pycolmap.Reconstruction(out / "sparse" / "0")).max() < 0.01
+    assert errors_of_centres(pycolmap.Reconstruction(out / "sparse/0")).max() < 0.01
 
 
 @pytest.mark.hard_case(
@@ -119,7 +120,7 @@ def test_a_video_of_panoramas_becomes_views(panoramas: list[Image.Image], tmp_pa
     summary = process(Process(tmp_path / "film.mp4", tmp_path / "out"))
     assert summary.matching == "sequential"
     assert summary.registered >= 0.9 * summary.photos == 0.9 * COUNT * VIEWS
-    assert errors_of_centres(pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")).max() < 0.01
+    assert errors_of_centres(pycolmap.Reconstruction(tmp_path / "out/sparse/0")).max() < 0.01
 
 
 def test_views_are_those_of_a_pinhole_camera_across_the_seam(panoramas: list[Image.Image]):
@@ -203,7 +204,8 @@ def test_pairs_of_fisheye_circles_are_refused(panoramas: list[Image.Image], tmp_
         fisheye_pair(panorama).resize((1024, 512)).save(source / f"{i}.jpg", quality=80)
     next(draw_photos()).save(source / "phone.jpg")
     out = tmp_path / "scene"
-    assert main([str(source), str(out)]) == 2
+    status = main([str(source), str(out)])
+    assert status == 2
     problem = f"4 of the 5 photos in {source}, such as 0.jpg, show two fisheye circles side by side"
     printed = capsys.readouterr().err
     assert problem in printed
@@ -216,7 +218,8 @@ def test_a_few_pairs_of_circles_among_other_photos_are_left_to_colmap(panoramas:
     for i, photo in enumerate(itertools.islice(draw_photos(), 2), 1):
         photo.save(tmp_path / f"{i}.png")
     photos = read_photos(tmp_path, ["0.png", "1.png", "2.png"], lambda *step: None)
-    assert [photo.is_fisheye_pair for photo in photos] == [True, False, False]
+    is_fisheye_pairs = [photo.is_fisheye_pair for photo in photos]
+    assert is_fisheye_pairs == [True, False, False]
 
 
 def test_views_are_paired_with_those_of_other_panoramas():

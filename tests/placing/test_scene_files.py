@@ -37,7 +37,7 @@ def test_the_files_are_those_of_nerfstudio(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(scene_files, "_AT_ONCE", 30)
     model = model_of(num_cameras, 100)
     model.delete_point3D(50)
-    sparse = tmp_path / "theirs" / "sparse"
+    sparse = tmp_path / "theirs/sparse"
     sparse.mkdir(parents=True)
     model.write(sparse)
     colmap_to_json(sparse, tmp_path / "theirs")
@@ -45,8 +45,10 @@ def test_the_files_are_those_of_nerfstudio(tmp_path: Path, monkeypatch: pytest.M
     ours = tmp_path / "ours"
     ours.mkdir()
     scene_files.write_transforms(model, ours, colmap_to_json)
-    assert sorted(path.name for path in ours.iterdir()) == ["sparse_pc.ply", "transforms.json"]
+    actual = sorted(path.name for path in ours.iterdir())
+    assert actual == ["sparse_pc.ply", "transforms.json"]
     for name in ("sparse_pc.ply", "transforms.json"):
         assert (ours / name).read_bytes() == (tmp_path / "theirs" / name).read_bytes()
     assert model.num_points3D() == 99, "the model stays as it is"
-    assert capsys.readouterr().out == ""
+    printed = capsys.readouterr().out
+    assert printed == ""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
 from helpers.drawn_textures import energy, photograph, psnr
@@ -68,7 +69,7 @@ def test_the_camera_is_colmap_s_and_pixels_lie_where_it_says():
     at_y, at_x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     found = np.array([(at_x * image).sum(), (at_y * image).sum()]) / image.sum()
     expected = np.asarray(undistorted.img_from_cam(ray))[0]
-    np.testing.assert_allclose(found, expected, atol=0.05)
+    assert_allclose(found, expected, atol=0.05)
 
 
 def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -97,18 +98,19 @@ def test_each_photo_has_its_camera_s_warp_and_no_warp_is_made_twice(tmp_path: Pa
         images.write_model(made)
         images.wait()
     assert asked == [(90, 60), (60, 90)]
-    model = pycolmap.Reconstruction(tmp_path / "undistorted" / "sparse" / "0")
+    model = pycolmap.Reconstruction(tmp_path / "undistorted/sparse/0")
     options = pycolmap.UndistortCameraOptions()
     for camera_id, camera in cameras.items():
         expected = pycolmap.undistort_camera(options, camera)
         assert model.cameras[camera_id].params.tolist() == expected.params.tolist()
-    written = sorted((tmp_path / "undistorted" / "images").iterdir())
-    assert [file.name for file in written] == ["1.png", "2.png", "3.png", "4.png"]
+    written = sorted((tmp_path / "undistorted/images").iterdir())
+    names = [file.name for file in written]
+    assert names == ["1.png", "2.png", "3.png", "4.png"]
     for file in written:
         camera = cameras[made.images[int(file.stem)].camera_id]
         warp = warp_of(camera, options)
         assert warp is not None
-        np.testing.assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
+        assert_array_equal(read_pixels(file), warp(read_pixels(photos / file.name)))
 
 
 def model_of_photos(folder: Path, number: int) -> pycolmap.Reconstruction:
@@ -127,7 +129,7 @@ def model_of_photos(folder: Path, number: int) -> pycolmap.Reconstruction:
 
 def test_a_photo_that_is_gone_is_named_when_the_model_is_written(tmp_path: Path):
     made = model_of_photos(tmp_path / "photos", 3)
-    (tmp_path / "photos" / "2.png").unlink()
+    (tmp_path / "photos/2.png").unlink()
     with undistortion.Undistortion(tmp_path / "photos", tmp_path / "model", 0, ()) as images:
         images.begin(made)
         images.write_model(made)
@@ -151,7 +153,7 @@ def test_images_that_are_not_begun_are_dropped_where_the_files_fail(tmp_path: Pa
         images.begin(made)
         threading.Timer(0.2, goes_on.set).start()
         raise OSError("full")
-    assert len(list((tmp_path / "undistorted" / "images").glob("*.png"))) <= 1
+    assert len(list((tmp_path / "undistorted/images").glob("*.png"))) <= 1
 
 
 def test_keypoints_of_the_model_move_with_the_images():
@@ -168,9 +170,9 @@ def test_keypoints_of_the_model_move_with_the_images():
     rays = np.c_[np.asarray(camera.cam_from_img(points))[:, :2], np.ones(2)]
     expected = np.asarray(new.img_from_cam(rays))
     actual = [point.xy for point in model.images[1].points2D]
-    np.testing.assert_allclose(actual, expected, atol=1e-9)
+    assert_allclose(actual, expected, atol=1e-9)
     actual = [point.xy for point in made.images[1].points2D]
-    np.testing.assert_allclose(actual, points)
+    assert_allclose(actual, points)
 
 
 def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):

@@ -8,9 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose
 from torch import Tensor
+from torch.testing import assert_close
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from helpers.gsplat_like import splatted
 from helpers.rendered_scene import random_scene
 from sadgs_ns.render import backend_torch
@@ -30,7 +34,7 @@ def look_from(angle: float, distance: float) -> Tensor:
 
 def small_scene(gaussians: int = 24, seed: int = 0) -> dict[str, Any]:
     """float64 arguments of `rasterization` that reach all of its cut-offs, for an image of 37 x 29 px."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = seeded(seed)
     means = torch.rand(gaussians, 3, generator=generator, dtype=torch.float64) * 2.0 - 1.0
     means[:, 1] *= 0.6
     scales = 0.02 + 0.3 * torch.rand(gaussians, 3, generator=generator, dtype=torch.float64) ** 2
@@ -149,9 +153,9 @@ def test_agrees_with_the_reference(per_axis: bool) -> None:
     expected_colors[..., 3:] /= np.maximum(expected_alphas, 1e-10)
     assert colors.dtype == torch.float64
     actual = colors[0].numpy()
-    np.testing.assert_allclose(actual, expected_colors, rtol=0, atol=1e-12)
+    assert_allclose(actual, expected_colors, rtol=0, atol=1e-12)
     actual = alphas[0].numpy()
-    np.testing.assert_allclose(actual, expected_alphas, rtol=0, atol=1e-12)
+    assert_allclose(actual, expected_alphas, rtol=0, atol=1e-12)
     for index in range(len(scene["means"])):
         one = reference_gaussian(scene, index, per_axis)
         radii = np.zeros(2) if one is None else one["radii"]
@@ -169,14 +173,12 @@ def test_tile_size(tile_size: int) -> None:
     colors, _, _ = render(scene, tile_size=tile_size, per_axis_radii=False)
     expected, _ = reference_render(scene, per_axis=False, tile_size=tile_size)
     actual = colors[0].numpy()
-    np.testing.assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-12)
+    assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-12)
 
 
 def test_spherical_harmonics() -> None:
     scene = small_scene()
-    coefficients = torch.randn(
-        len(scene["means"]), 9, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
-    )
+    coefficients = torch.randn(len(scene["means"]), 9, 3, dtype=torch.float64, generator=seeded(1))
     camera = -scene["viewmats"][0, :3, :3].T @ scene["viewmats"][0, :3, 3]
     directions = torch.nn.functional.normalize(scene["means"] - camera, dim=-1)
     basis = torch.cat([torch.full_like(directions[:, :1], 0.28209479177), -0.48860251190292 * directions], dim=-1)
@@ -186,7 +188,7 @@ def test_spherical_harmonics() -> None:
     for given in (coefficients, (coefficients[:, 0], coefficients[:, 1:])):
         colors, _, _ = render(scene, colors=given, sh_degree=1, per_axis_radii=False)
         actual = colors[0].numpy()
-        np.testing.assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-10)
+        assert_allclose(actual, expected[..., :3], rtol=0, atol=1e-10)
 
 
 @pytest.mark.usefixtures("segment")
@@ -196,7 +198,7 @@ def test_gradients_agree_with_finite_differences() -> None:
     scene["means"] *= 0.3
     scene["scales"] = 0.15 + 0.5 * scene["scales"]
     scene["opacities"] = torch.linspace(0.3, 0.9, 6, dtype=torch.float64)
-    scene["colors"] = torch.randn(6, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    scene["colors"] = torch.randn(6, 4, 3, dtype=torch.float64, generator=seeded(2))
     scene |= {"width": 6, "height": 5, "Ks": scene["Ks"] / 6.0}
     scene["Ks"][0, 2, 2] = 1.0
     names = ["means", "quats", "scales", "opacities", "colors", "viewmats"]
@@ -244,7 +246,7 @@ def pixel_losses(
 def test_absgrad_sums_the_absolute_gradients_of_the_pixels() -> None:
     scene: dict[str, Any] = {**small_scene(gaussians=8), "width": 21, "height": 18}
     scene["means"].requires_grad_()
-    weights = torch.rand(18, 21, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4)) - 0.3
+    weights = torch.rand(18, 21, 3, dtype=torch.float64, generator=seeded(4)) - 0.3
     colors, _, info = render(scene, absgrad=True, per_axis_radii=False)
     info["means2d"].retain_grad()
     (weights * colors[0].square()).sum().backward()
@@ -257,8 +259,10 @@ def test_absgrad_sums_the_absolute_gradients_of_the_pixels() -> None:
             (gradient,) = torch.autograd.grad(loss, means2d)
             total += gradient
             absolute += gradient.abs()
-    torch.testing.assert_close(info["means2d"].grad[0], total)
-    torch.testing.assert_close(info["means2d"].absgrad[0], absolute)
+    actual = info["means2d"].grad[0]
+    assert_close(actual, total)
+    actual = info["means2d"].absgrad[0]
+    assert_close(actual, absolute)
     assert (absolute > total.abs() + 1e-3).any()
 
 
@@ -283,8 +287,10 @@ def test_info_has_keys_and_shapes_of_gsplat(per_axis: bool) -> None:
         "opacities": (1, n),
     }
     numbers = {"width": 37, "height": 29, "n_cameras": 1}
-    assert {name: tuple(info[name].shape) for name in shapes} == shapes
-    assert {name: info[name] for name in numbers} == numbers
+    actual = {name: tuple(info[name].shape) for name in shapes}
+    assert actual == shapes
+    actual = {name: info[name] for name in numbers}
+    assert actual == numbers
     assert info["radii"].dtype == torch.int32
     assert info["flatten_ids"].dim() == 1
     assert set(info) == set(shapes) | set(numbers) | {"flatten_ids"}
@@ -351,8 +357,8 @@ def test_two_cameras_equal_two_calls() -> None:
     colors, alphas, info = render(scene | both, Ks=scene["Ks"].expand(2, 3, 3))
     for index, view in enumerate(views):
         one_colors, one_alphas, one_info = render(scene | view)
-        torch.testing.assert_close(colors[index], one_colors[0], rtol=0, atol=1e-14)
-        torch.testing.assert_close(alphas[index], one_alphas[0], rtol=0, atol=1e-14)
+        assert_within(colors[index], one_colors[0], 1e-14)
+        assert_within(alphas[index], one_alphas[0], 1e-14)
         assert torch.equal(info["radii"][index], one_info["radii"][0])
 
 

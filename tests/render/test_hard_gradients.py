@@ -27,8 +27,11 @@ import torch
 from gsplat.cuda._torch_impl import _spherical_harmonics
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from torch import Tensor
+from torch.testing import assert_close
 
 from helpers import small_scenes
+from helpers.closeness import assert_within_share
+from helpers.generators import seeded
 from helpers.gsplat_like import splatted
 from helpers.kill_and_resume import differences
 from helpers.short_runs import checkpoint, configure, train
@@ -45,7 +48,7 @@ WIDTH = 12
 
 
 def noise(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.rand(shape, generator=seeded(seed), dtype=torch.float64)
 
 
 # --- the loss: torch code by gradcheck, Triton kernels against torch in float64 ---
@@ -117,8 +120,8 @@ def test_the_kernels_loss_and_gradient_equal_the_float64_reference(name: str):
         (gradient,) = torch.autograd.grad(loss, x)
         results.append((loss.detach().double(), psnr.double(), gradient.double()))
     (loss, psnr, gradient), (expected_loss, expected_psnr, expected) = results
-    torch.testing.assert_close(loss, expected_loss, atol=2e-6, rtol=1e-7)
-    torch.testing.assert_close(psnr, expected_psnr, atol=1e-5, rtol=1e-6)
+    assert_close(loss, expected_loss, atol=2e-6, rtol=1e-7)
+    assert_close(psnr, expected_psnr, atol=1e-5, rtol=1e-6)
     # SSIM of equal images has no slope; what is left is measured by L1's gradient. At white, its variances are
     # differences of numbers near 1 and beside 0.03² in float32: torch's own float32 code errs there as much.
     scale = max(float(expected.abs().max()), 0.8 / expected.numel())
@@ -140,7 +143,7 @@ def test_views_smaller_than_ssims_window_take_the_torch_code(shape: tuple[int, .
     loss, _ = losses.photometric_loss(predicted.float(), target.float())
     assert torch.autograd.gradcheck(lambda x: losses.photometric_loss(x, target)[0], (predicted.requires_grad_(),))
     expected = losses.photometric_loss(predicted, target)[0].detach()
-    torch.testing.assert_close(loss.double(), expected, rtol=1e-5, atol=0)
+    assert_within_share(loss.double(), expected, 1e-5)
 
 
 @pytest.mark.hard_case("no upstream gradient", "none flows")
@@ -286,13 +289,13 @@ def compare_harmonics(degree: int, values: list[Tensor], viewmats: Tensor, drawn
         0
     )
     (expected * weights * drawn[..., None]).sum().backward()
-    torch.testing.assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=1e-5, rtol=1e-5)
+    assert_close(colors[drawn.to(DEVICE)].double().cpu(), expected[drawn], atol=1e-5, rtol=1e-5)
     gradients = []
     for actual, reference in zip(fast, slow, strict=True):
         assert actual.grad is not None
         wanted = torch.zeros_like(reference) if reference.grad is None else reference.grad
         scale = max(float(wanted.abs().max()) if wanted.numel() else 0.0, 1.0)
-        torch.testing.assert_close(actual.grad.double().cpu(), wanted, atol=2e-5 * scale, rtol=2e-5)
+        assert_close(actual.grad.double().cpu(), wanted, atol=2e-5 * scale, rtol=2e-5)
         gradients.append(actual.grad.cpu())
     return gradients
 

@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 import torch
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
+from helpers.refusals import refusal
 from helpers.rendered_scene import random_scene, render_with_gradients
-from sadgs_ns.errors import InputError
 from sadgs_ns.render import rasterization
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
 
@@ -35,13 +37,14 @@ def test_the_backend_follows_the_device(
     wanted: Any, device: str, triton: bool, chosen: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     devices_have(monkeypatch, triton)
-    assert rasterization.choose_backend(wanted, torch.device(device)) == chosen
+    actual = rasterization.choose_backend(wanted, torch.device(device))
+    assert actual == chosen
 
 
 @pytest.mark.parametrize(("wanted", "device"), [("gsplat", "cpu"), ("triton", "cpu"), ("triton", "cuda")])
 def test_a_backend_that_does_not_run_here_is_refused(wanted: Any, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     devices_have(monkeypatch, triton=False)
-    with pytest.raises(InputError, match=rf"^The backend {wanted} [^.]+{device}[^.]*: set [^\n]+\.yml\.$"):
+    with refusal(rf"^The backend {wanted} [^.]+{device}[^.]*: set [^\n]+\.yml\.$"):
         rasterization.choose_backend(wanted, torch.device(device))
 
 
@@ -86,7 +89,7 @@ def test_viewmat_by_hand() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_viewmats_project_nerfstudios_rays_to_their_pixels(dtype: torch.dtype) -> None:
     cameras = pytest.importorskip("nerfstudio.cameras.cameras")
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     rotations = torch.linalg.qr(torch.randn(3, 3, 3, generator=generator))[0]
     rotations *= torch.linalg.det(rotations)[:, None, None]
     poses = torch.cat([rotations, torch.randn(3, 3, 1, generator=generator)], dim=-1)
@@ -101,7 +104,7 @@ def test_viewmats_project_nerfstudios_rays_to_their_pixels(dtype: torch.dtype) -
         pixels = seen @ camera[index].get_intrinsics_matrices().to(dtype).T
         expected = camera.get_image_coords().flip(-1).reshape(-1, 2).to(dtype)  # pixel centres as (x, y)
         actual = pixels[:, :2] / pixels[:, 2:]
-        torch.testing.assert_close(actual, expected, rtol=0, atol=1e-3)
+        assert_within(actual, expected, 1e-3)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")

@@ -40,7 +40,8 @@ def render(
 
 def test_a_view_is_foreseen_from_its_second_visit_on_with_a_margin():
     forecast = TileForecast()
-    assert render(forecast, [3], [1_000_000]) == (None, [])
+    actual = render(forecast, [3], [1_000_000])
+    assert actual == (None, [])
     capacity, lost = render(forecast, [3], [1_000_000])
     assert capacity is not None
     assert not lost

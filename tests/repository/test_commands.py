@@ -58,4 +58,5 @@ def test_the_doctor_imports_torch_and_little_else(tmp_path: Path):
 def test_each_command_prints_its_version(name: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit, match=r"^0$"):
         importlib.import_module(SCRIPTS[name]).main(["--version"])
-    assert capsys.readouterr().out == f"{name} {version('sadgs_ns')}\n"
+    printed = capsys.readouterr().out
+    assert printed == f"{name} {version('sadgs_ns')}\n"

@@ -7,7 +7,6 @@ filled in by hand, so that a new one without either fails here.
 from __future__ import annotations
 
 import ast
-import json
 import re
 import shlex
 import shutil
@@ -25,6 +24,7 @@ from test_documented_commands import understood
 
 from examples.drawn_scene.scene import SPARSE_FOLDER, write_scene
 from helpers.drawn_photos import color_profile
+from helpers.json_files import read_json, write_json
 from helpers.short_runs import nerfstudio_data
 from helpers.small_scenes import HEIGHT, WIDTH
 from sadgs_ns.cli import doctor
@@ -197,9 +197,9 @@ def no_json_copies(data: Path) -> list[Finding]:
 
 def without_test_views(data: Path) -> list[Finding]:
     path = as_json(data) / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     names = [frame["file_path"] for frame in meta["frames"]]
-    path.write_text(json.dumps(meta | {"train_filenames": names[1:], "val_filenames": names[:1]}))
+    write_json(path, meta | {"train_filenames": names[1:], "val_filenames": names[:1]})
     return check_data(data)
 
 
@@ -394,7 +394,8 @@ def test_a_new_command_is_found(tmp_path: Path):
     source.write_text(
         'def f(x):\n    """Run `sadgs-process NOT THIS`."""\n    return f"call `sadgs-export {x} --new`"\n'
     )
-    assert [command for text in texts(source) for command in commands_in(text)] == ["sadgs-export … --new"]
+    actual = [command for text in texts(source) for command in commands_in(text)]
+    assert actual == ["sadgs-export … --new"]
 
 
 @pytest.mark.parametrize("command", FILLED)
@@ -432,9 +433,11 @@ def test_the_doctor_s_next_command_reads_the_data(
     data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.setattr(doctor, "check_machine", lambda: iter([]))
-    assert doctor.main([str(data)]) == 0
+    status = doctor.main([str(data)])
+    assert status == 0
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("Next: "))
     config = read_options(words[2:])
     manager: Any = config.pipeline.datamanager
     manager.data = config.data
-    assert [finding for finding in check_capture(manager) if finding.severity != "note"] == []
+    actual = [finding for finding in check_capture(manager) if finding.severity != "note"]
+    assert actual == []

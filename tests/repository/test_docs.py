@@ -107,7 +107,7 @@ def test_documents_that_the_code_names_are_there():
 
 def test_every_figure_is_shown():
     shown = {(path.parent / link).resolve() for path in DOCUMENTS for link in links(path)}
-    assert {path for path in (CHECKOUT / "docs" / "figures").iterdir()} <= shown
+    assert {path for path in (CHECKOUT / "docs/figures").iterdir()} <= shown
 
 
 def test_every_test_that_a_document_names_is_there():

@@ -27,6 +27,7 @@ USES = {
 }
 MAX_FLAT = 9
 MAX_LINES = 600
+NO_KERNELS = {"shared", "trial"}  # Files of `kernels` whose functions other files test
 """Most lines of a file of the package."""
 
 
@@ -65,7 +66,8 @@ def folder(name: str) -> str:
 
 
 def test_the_folders_depend_on_each_other_in_one_way():
-    assert {folder(name) for name in FILES} == USES.keys()
+    actual = {folder(name) for name in FILES}
+    assert actual == USES.keys()
     for name, imported in GRAPH.items():
         wrong = [other for other in imported if folder(other) not in {folder(name), "", *USES[folder(name)]}]
         assert not wrong, f"{name} must not import {wrong}"
@@ -96,7 +98,20 @@ def test_few_modules_lie_flat_in_the_package():
 
 def test_no_file_is_too_long():
     lines = {path.relative_to(ROOT).as_posix(): path.read_text("utf8").count("\n") for path in ROOT.rglob("*.py")}
-    assert {name: number for name, number in lines.items() if number > MAX_LINES} == {}
+    actual = {name: number for name, number in lines.items() if number > MAX_LINES}
+    assert actual == {}
+
+
+def test_each_file_of_kernels_has_a_module_of_tests_with_its_name():
+    """So that `pytest tests -k NAME` runs the tests of one kernel."""
+    modules = {path.stem for path in (ROOT.parent / "tests").rglob("test_*.py")}
+    without_tests = []
+    for path in sorted((ROOT / "kernels").glob("*.py")):
+        launches = "@triton.jit" in path.read_text("utf8")
+        expected = {f"test_{path.stem}", f"test_{path.stem}_kernel"}
+        if launches and path.stem not in NO_KERNELS and modules.isdisjoint(expected):
+            without_tests.append(path.name)
+    assert without_tests == []
 
 
 def names_of_gsplat(path: Path) -> set[str]:

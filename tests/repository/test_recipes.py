@@ -15,6 +15,7 @@ import yaml
 from benchmarks import __main__ as bench
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers import forked_python
+from helpers.generators import seeded
 from helpers.small_scenes import adam, camera, random_params, training_step
 from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
@@ -50,7 +51,7 @@ def train(strategy: StructureAwareStrategy, steps: int) -> tuple[dict[str, Any],
     optimizers = adam(params)
     state = strategy.initialize_state(1.0)
     viewmats, Ks = camera(WIDTH, HEIGHT)
-    images = torch.rand((1, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(0))
+    images = torch.rand((1, HEIGHT, WIDTH, 3), generator=seeded(0))
     tensors = multiscale_structure_tensor(images)
     counts = []
     for step in range(steps):
@@ -118,7 +119,7 @@ def test_a_stage(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, c
     monkeypatch.setattr(sadgs, "STAGES", dict.fromkeys(sadgs.STAGES, stub) | added)
     monkeypatch.setattr(PhotosToSplat, "worker", lambda *others: None)
     command = [str(scene), "--output", str(tmp_path / "out"), "--formats", "ply"]
-    archive = tmp_path / "out" / "log.zip"
+    archive = tmp_path / "out/log.zip"
     for status in (f"{archive}", f"{archive}; done before"):
         assert sadgs.main(command) == 0
         lines = re.findall(r"^(\S+) +\d:\d\d  (.*)$", capsys.readouterr().out, re.MULTILINE)
@@ -137,7 +138,7 @@ def test_a_protocol(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     row["overrides"]["max_num_iterations"] = 2
     (tmp_path / "mine.yaml").write_text(yaml.dump({"scenes": {"garden": garden}, "seeds": [0], "rows": [row]}))
     (tmp_path / garden["data"]).symlink_to(scene)
-    results = tmp_path / "docs" / "results"
+    results = tmp_path / "docs/results"
     results.mkdir(parents=True)
     monkeypatch.setenv("TORCH_HOME", "/dev/null")  # LPIPS is left out.
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
@@ -153,7 +154,8 @@ def test_a_protocol(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (results / "tables.yaml").write_text(yaml.dump({"megapixels": {}, "tables": {"mine": table}}))
     document = tmp_path / "README.md"
     document.write_text("<!-- table: mine -->\n<!-- end -->\n")
-    assert bench.main(["documents", str(tmp_path)]) == 0
+    status = bench.main(["documents", str(tmp_path)])
+    assert status == 0
     assert f"| garden | half the effort | {found['psnr']:.2f} |" in document.read_text()
 
 

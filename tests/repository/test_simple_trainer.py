@@ -81,8 +81,9 @@ def test_the_loop_runs_and_splits(calls: list[int]):
 @pytest.mark.slow
 def test_the_program_learns_its_photos(calls: list[int], capsys: pytest.CaptureFixture[str]):
     torch.manual_seed(0)
-    untrained = simple_trainer.main("cpu", 48, 36, iterations=1)
-    trained = simple_trainer.main("cpu", 48, 36, iterations=60)
-    assert trained > untrained + 3
+    untrained = simple_trainer.main("cpu", 32, 24, iterations=1)
+    trained = simple_trainer.main("cpu", 32, 24, iterations=30)
+    assert trained > untrained + 8, "growth alone, without learning, brings 7"
     assert max(calls) > calls[0]
-    assert re.search(r"^800 points became [\d,]+ Gaussians; PSNR \d+\.\d\d dB$", capsys.readouterr().out, re.MULTILINE)
+    printed = capsys.readouterr().out
+    assert re.search(r"^800 points became [\d,]+ Gaussians; PSNR \d+\.\d\d dB$", printed, re.MULTILINE)

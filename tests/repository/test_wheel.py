@@ -95,7 +95,7 @@ def test_the_wheel_holds_all_files_of_the_package_and_no_others(wheel: Wheel):
     assert "sadgs_ns/py.typed" in files
     assert "sadgs_ns/__init__.py" in files
     assert names - described == files
-    assert os.access(wheel.installed / "sadgs_ns" / "launchers" / "ffmpeg", os.X_OK)
+    assert os.access(wheel.installed / "sadgs_ns/launchers/ffmpeg", os.X_OK)
 
 
 IMPORT_ALL = """
@@ -124,7 +124,8 @@ print(json.dumps([failures, ours]))
 def test_all_modules_and_entry_points_are_imported_from_the_wheel(wheel: Wheel, tmp_path: Path):
     (metadata,) = wheel.installed.glob("*.dist-info")
     entry_points = Distribution.at(metadata).entry_points
-    assert {entry_point.group for entry_point in entry_points} == {*ENTRY_POINTS}
+    groups = {entry_point.group for entry_point in entry_points}
+    assert groups == {*ENTRY_POINTS}
     workers = functions_of_workers()
     assert len(workers) >= 3, "sadgs runs its stages in processes"
     modules = modules_of_the_package()

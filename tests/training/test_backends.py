@@ -13,10 +13,10 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 
 from helpers.gsplat_stub import stub_gsplat
 from helpers.kill_and_resume import set_up
+from helpers.refusals import refusal
 from helpers.short_runs import ITERATIONS, configure, is_finite, train
 from sadgs_ns.cli import export
 from sadgs_ns.distributed.world import World
-from sadgs_ns.errors import InputError
 from sadgs_ns.gsplat_compat import RADII_PER_AXIS
 from sadgs_ns.render import rasterization
 from sadgs_ns.training import config as config_module
@@ -87,7 +87,8 @@ def test_it_trains_resumes_and_exports(
         for name, value in model.gauss_params.items():
             assert torch.equal(again.pipeline.model.gauss_params[name], value), name
     path = tmp_path / "splat.ply"
-    assert export.main([str(whole.base_dir), "--output", str(path)]) == 0
+    status = export.main([str(whole.base_dir), "--output", str(path)])
+    assert status == 0
     assert f"element vertex {model.num_points}\n".encode() in path.read_bytes()
 
 
@@ -130,9 +131,9 @@ def test_of_kernels_that_draw_none_is_compiled_ahead(config: SadgsTrainerConfig,
 @pytest.mark.hard_case("the gsplat backend without CUDA, or on several GPUs", "refused in one sentence")
 def test_where_it_cannot_draw_it_is_refused(config: SadgsTrainerConfig, monkeypatch: pytest.MonkeyPatch):
     config.machine.device_type = "cpu"
-    with pytest.raises(InputError, match=r"^The backend gsplat needs a CUDA device, and this is cpu: set .+\.yml\.$"):
+    with refusal(r"^The backend gsplat needs a CUDA device, and this is cpu: set .+\.yml\.$"):
         set_up(config)
-    with pytest.raises(InputError, match=r"^The backend gsplat works on one device only, and this run takes several: "):
+    with refusal(r"^The backend gsplat works on one device only, and this run takes several: "):
         rasterization.choose_backend("gsplat", torch.device("cuda"), single_process=False)
     config.pipeline.model.backend = "auto"
     model = set_up(config).pipeline.model

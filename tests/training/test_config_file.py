@@ -15,14 +15,16 @@ OLD_RUNS = Path(__file__).parents[1] / "old_runs"
 
 def test_options_are_read_as_pyyaml_s_full_loader_reads_them():
     text = yaml.dump(sadgs.config)
-    assert yaml.dump(yaml.load(text, Loader=ConfigLoader)) == text
+    actual = yaml.dump(yaml.load(text, Loader=ConfigLoader))
+    assert actual == text
 
 
 @pytest.mark.parametrize("run", sorted(OLD_RUNS.iterdir()), ids=lambda run: run.name)
 def test_options_of_earlier_versions_are_read_too(run: Path):
-    text = (run / "run" / "config.yml").read_text("utf8")
+    text = (run / "run/config.yml").read_text("utf8")
     expected = yaml.load(text, Loader=yaml.Loader)
-    assert yaml.dump(yaml.load(text, Loader=ConfigLoader)) == yaml.dump(expected)
+    actual = yaml.dump(yaml.load(text, Loader=ConfigLoader))
+    assert actual == yaml.dump(expected)
 
 
 @pytest.mark.hard_case("`sadgs-inspect` of a config.yml that runs a program", "refused, and nothing is run")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import shutil
 import sys
 from collections.abc import Callable, Sequence
@@ -20,9 +19,14 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
 from nerfstudio.data.dataparsers.scannet_dataparser import ScanNetDataParserConfig
 from nerfstudio.data.utils import colmap_parsing_utils
 from nerfstudio.process_data.colmap_utils import create_ply_from_colmap
+from numpy.testing import assert_allclose
 from plyfile import PlyData, PlyElement
+from torch.testing import assert_close
 
 from examples.drawn_scene.scene import SPARSE_FOLDER
+from helpers.closeness import assert_within
+from helpers.json_files import read_json, write_json
+from helpers.refusals import refusal
 from helpers.short_runs import blender_data, nerfstudio_data
 from sadgs_ns.data import ply
 from sadgs_ns.data.checks.capture import check_capture
@@ -160,25 +164,25 @@ def test_colmap_s_points_of_an_old_ns_process_data_are_read_without_a_question(
     parser = nerfstudio_data(tmp_path)
     path = tmp_path / "transforms.json"
     shutil.copytree(colmap.data / SPARSE_FOLDER, tmp_path / "colmap/sparse/0")
-    before = {**json.loads(path.read_text()), **({} if transform is None else {"applied_transform": transform})}
-    path.write_text(json.dumps(before))
+    before = {**read_json(path), **({} if transform is None else {"applied_transform": transform})}
+    write_json(path, before)
     metadata = load(parser).train_dataset.metadata  # a question would raise: pytest gives it no terminal
     of_file = load(dataclasses.replace(parser, data=path)).train_dataset.metadata
     assert torch.equal(of_file["points3D_xyz"], metadata["points3D_xyz"])
-    assert json.loads(path.read_text()) == before
+    assert read_json(path) == before
     assert reads == []
     applied = torch.tensor(transform or [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], dtype=torch.float32)
     create_ply_from_colmap("p.ply", tmp_path / "colmap/sparse/0", tmp_path, applied)  # what it would do after a yes
-    path.write_text(json.dumps({**before, "applied_transform": applied.tolist(), "ply_file_path": "p.ply"}))
+    write_json(path, {**before, "applied_transform": applied.tolist(), "ply_file_path": "p.ply"})
     expected = load(parser).train_dataset.metadata
-    torch.testing.assert_close(metadata["points3D_xyz"], expected["points3D_xyz"], atol=3e-6, rtol=0)  # 6 digits
+    assert_within(metadata["points3D_xyz"], expected["points3D_xyz"], 3e-6)  # 6 digits
     assert torch.equal(metadata["points3D_rgb"], expected["points3D_rgb"])
 
 
 def change_description(data: Path, **values: Any) -> dict[str, Any]:
     """Change values of the transforms.json of a capture, and return all."""
-    described = json.loads((data / "transforms.json").read_text()) | values
-    (data / "transforms.json").write_text(json.dumps(described))
+    described = read_json(data / "transforms.json") | values
+    write_json(data / "transforms.json", described)
     return described
 
 
@@ -202,10 +206,10 @@ def test_views_that_are_added_move_nothing_in_a_frame_that_the_data_fix(colmap: 
     assert len(fixed.cameras) == len(frames)
     same = [fixed.image_filenames.index(path) for path in first.image_filenames]
     actual = fixed.cameras.camera_to_worlds[same]
-    torch.testing.assert_close(actual, first.cameras.camera_to_worlds, atol=1e-6, rtol=0)
+    assert_within(actual, first.cameras.camera_to_worlds, 1e-6)
     actual = fixed.metadata["points3D_xyz"]
     expected = first.metadata["points3D_xyz"]
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    assert_within(actual, expected, 1e-6)
 
 
 @pytest.mark.hard_case(
@@ -223,7 +227,7 @@ def test_views_that_are_added_move_nothing_in_a_frame_that_the_data_fix(colmap: 
 def test_a_frame_that_is_none_is_refused(values: dict[str, Any], told: str, tmp_path: Path):
     parser = nerfstudio_data(tmp_path)
     change_description(tmp_path, **values)
-    with pytest.raises(InputError, match=rf"transforms.json does not tell with .* is to be moved \(.*{told}"):
+    with refusal(rf"transforms.json does not tell with .* is to be moved \(.*{told}"):
         load(parser)
 
 
@@ -241,7 +245,7 @@ def ply_scene(
     """A dataset with the points above in a PLY file."""
     parser = nerfstudio_data(folder)
     path = folder / "transforms.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "ply_file_path": "points.ply"}))
+    write_json(path, {**read_json(path), "ply_file_path": "points.ply"})
     kind = [] if colors is None else [(name, colors.dtype.str) for name in names]
     vertices = np.empty(len(positions), [(axis, "<f8") for axis in "xyz"] + kind)
     for k in range(3):
@@ -288,16 +292,16 @@ def test_a_capture_on_a_map_trains_as_at_the_origin(kind: str, colmap: ColmapDat
                 described.pop("ply_file_path")
                 shutil.copytree(colmap.data / SPARSE_FOLDER, folder / "colmap/sparse/0")
                 move_model(folder / "colmap/sparse/0", offset)
-            (folder / "transforms.json").write_text(json.dumps(described))
+            write_json(folder / "transforms.json", described)
         outputs.append(load(parser).train_dataparser_outputs)
     near, far = outputs
-    torch.testing.assert_close(far.cameras.camera_to_worlds, near.cameras.camera_to_worlds, atol=1e-5, rtol=0)
+    assert_within(far.cameras.camera_to_worlds, near.cameras.camera_to_worlds, 1e-5)
     points = [each.metadata["points3D_xyz"] for each in outputs]
-    torch.testing.assert_close(points[1], points[0], atol=1e-5, rtol=0)
+    assert_within(points[1], points[0], 1e-5)
     maps = [Similarity.of(each.dataparser_scale * each.dataparser_transform.double().numpy()) for each in outputs]
     there = maps[0].inverse().positions(points[0].double().numpy())
     here = maps[1].inverse().positions(points[1].double().numpy())
-    np.testing.assert_allclose(here - by, there, atol=1e-4)
+    assert_allclose(here - by, there, atol=1e-4)
 
 
 def test_poses_that_shall_not_be_centred_stay_or_are_refused(colmap: ColmapDataParserConfig, tmp_path: Path):
@@ -309,7 +313,7 @@ def test_poses_that_shall_not_be_centred_stay_or_are_refused(colmap: ColmapDataP
     assert torch.equal(outputs.dataparser_transform, torch.eye(4)[:3])
     assert outputs.cameras.camera_to_worlds[:, 0, 3].min() > 90
     move_model(data / SPARSE_FOLDER, np.array([1e6, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"^--center-method none leaves the cameras where float32 rounds .*: leave it"):
+    with refusal(r"^--center-method none leaves the cameras where float32 rounds .*: leave it"):
         load(parser)
 
 
@@ -322,7 +326,7 @@ def test_points_are_those_of_the_model_whose_cameras_are_read(colmap: ColmapData
     expected = load(parser).train_dataparser_outputs.metadata["points3D_xyz"]
     move_model(parser.data / SPARSE_FOLDER, np.array([1.0, 2.0, 3.0]), ".txt")
     found = load(parser).train_dataparser_outputs.metadata["points3D_xyz"]
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
+    assert_within(found, expected, 1e-5)
 
 
 @pytest.mark.parametrize("text", [True, False], ids=["text", "binary"])
@@ -340,7 +344,8 @@ def test_points_of_a_ply_file_are_read_once_and_without_open3d(
     outputs = datamanager.train_dataparser_outputs
     homogeneous = torch.cat([torch.tensor(POSITIONS), torch.ones(3, 1)], dim=1)
     expected = (homogeneous @ outputs.dataparser_transform.T.double() * outputs.dataparser_scale).float()
-    torch.testing.assert_close(outputs.metadata["points3D_xyz"], expected)
+    actual = outputs.metadata["points3D_xyz"]
+    assert_close(actual, expected)
     assert outputs.metadata["points3D_rgb"].tolist() == COLORS.tolist()
 
 
@@ -354,7 +359,7 @@ def test_other_parsers_read_a_ply_without_open3d(tmp_path: Path, monkeypatch: py
     parser.ply_path = tmp_path / "ply/points.ply"
     parser.scale_factor = 3.0
     metadata = load(parser).train_dataset.metadata
-    np.testing.assert_allclose(metadata["points3D_xyz"], 3 * POSITIONS)
+    assert_allclose(metadata["points3D_xyz"], 3 * POSITIONS)
     assert metadata["points3D_rgb"].tolist() == COLORS.tolist()
     folder = tmp_path / "scannet"
     for i, image in enumerate(sorted((tmp_path / "ply/images").iterdir())):
@@ -449,7 +454,8 @@ def test_points_are_found_among_what_else_a_ply_holds(kind: str, order: Any, tmp
 def test_points_without_colours_are_noted(colors: np.ndarray | None, tmp_path: Path):
     ply_scene(tmp_path, colors=colors)
     notes = [finding.sentence for finding in check_ply(tmp_path / "points.ply", [], "restore it")]
-    assert any("without colours" in note for note in notes) == (colors is None)
+    actual = any("without colours" in note for note in notes)
+    assert actual == (colors is None)
 
 
 @pytest.mark.hard_case("a splat's PLY as points", "read with its colours of degree 0")
@@ -464,7 +470,7 @@ def test_colours_of_a_splat_are_those_of_degree_0(tmp_path: Path):
 
 def test_what_is_no_ply_file_of_points_is_named(tmp_path: Path):
     (tmp_path / "points.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n")
-    with pytest.raises(InputError, match=r"points\.ply is not a PLY file of points \(.+\): restore it\.$"):
+    with refusal(r"points\.ply is not a PLY file of points \(.+\): restore it\.$"):
         ply.read_points(tmp_path / "points.ply")
 
 

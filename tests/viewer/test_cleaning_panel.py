@@ -94,7 +94,8 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     said = set_to(panel, min_views=3)
     set_to(panel, dust=0.5)
     views = len(pipeline.views)
-    assert [len(cameras) for cameras in looks] == [views]
+    actual = [len(cameras) for cameras in looks]
+    assert actual == [views]
     params = dict(model.gauss_params.items())
     seen = measure_visibility(params, looks[0], model.drawing)
     cleaning = Cleaning(min_views=3)
@@ -102,7 +103,8 @@ def test_what_views_see_is_measured_once_and_again_when_training_went_on(
     assert said.startswith(sentences[0])
     model.step += 1
     set_to(panel, dust=0.6)
-    assert [len(cameras) for cameras in looks] == [views, views]
+    actual = [len(cameras) for cameras in looks]
+    assert actual == [views, views]
 
 
 def test_a_reversed_box_is_told_and_changes_nothing(pipeline: SadgsPipeline, capsys: pytest.CaptureFixture[str]):
@@ -111,7 +113,8 @@ def test_a_reversed_box_is_told_and_changes_nothing(pipeline: SadgsPipeline, cap
     _, before = shown(pipeline)
     said = set_to(panel, crop_to=(-200.0, 100.0, 100.0))
     assert said.startswith("The picture stays as it was: --crop -100 -100 -100 -200 100 100 is no box: give ")
-    assert "is no box" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "is no box" in printed
     assert torch.equal(shown(pipeline)[1], before)
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from sadgs_ns.errors import InputError
+from helpers.refusals import refusal
 from sadgs_ns.geometry.cleaning import Cleaning, Remaining
 from sadgs_ns.viewer.cleaning_text import check_options, removal_sentences
 
@@ -36,7 +36,8 @@ NOTHING = torch.ones(0, dtype=torch.bool)
     ],
 )
 def test_a_sentence_says_what_each_option_takes(cleaning: Cleaning, num_removed: dict[str, int], told: list[str]):
-    assert removal_sentences(cleaning, Remaining(NOTHING, num_removed, num_views=5)) == told
+    actual = removal_sentences(cleaning, Remaining(NOTHING, num_removed, num_views=5))
+    assert actual == told
 
 
 @pytest.mark.parametrize(
@@ -50,5 +51,5 @@ def test_a_sentence_says_what_each_option_takes(cleaning: Cleaning, num_removed:
     ],
 )
 def test_what_cannot_be_meant_is_refused(options: dict, message: str):
-    with pytest.raises(InputError, match=message):
+    with refusal(message):
         check_options(Cleaning(**options))

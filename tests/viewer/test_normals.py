@@ -14,7 +14,9 @@ import torch
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.scripts.render import DatasetRender
 from PIL import Image
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
 from helpers.small_scenes import HEIGHT, WIDTH, camera
@@ -49,7 +51,7 @@ def test_a_normal_is_the_thinnest_axis_turned_towards_the_camera():
         facing = math.atan(math.tan(angle))  # A disc that is turned by π faces the camera again.
         expected = torch.tensor([-math.sin(facing), 0.0, -math.cos(facing)])
         actual = seen[24, 32]
-        torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
+        assert_within(actual, expected, 1e-5)
         assert (seen[0, 0] == 0).all(), "nothing is there"
 
 
@@ -71,11 +73,11 @@ def test_normals_are_in_the_world_s_axes_and_of_unit_length():
     viewmat[:3, :3] = rotation.T
     before = normals_map(plain, Cameras(viewmats, Ks, 64, 48))
     after = normals_map(turned, Cameras(viewmat[None], Ks, 64, 48))
-    torch.testing.assert_close(after, before @ rotation.T, atol=1e-4, rtol=0)
+    assert_within(after, before @ rotation.T, 1e-4)
     lengths = before.norm(dim=-1)
     actual = lengths[lengths > 0]
     expected = torch.ones_like(lengths[lengths > 0])
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     assert 0 < (lengths == 0).sum() < lengths.numel()
 
 
@@ -138,7 +140,7 @@ def test_evaluation_renders_no_normals_and_who_reads_them_gets_pictures(
     assert drawn.any()
     actual = (2 * normals[drawn] - 1).norm(dim=-1)
     expected = torch.ones(int(drawn.sum()))
-    torch.testing.assert_close(actual, expected, atol=1e-4, rtol=0)
+    assert_within(actual, expected, 1e-4)
     towards = view.camera_to_worlds[0, :, 2].to(normals)  # against the direction of view
     assert ((2 * normals[drawn] - 1) @ towards > 0).float().mean() > 0.9
 
@@ -207,4 +209,4 @@ def test_normals_on_a_gpu_are_those_of_the_cpu():
     on_gpu = normals_map(moved, Cameras(viewmats.cuda(), Ks.cuda(), 64, 48)).cpu()
     both = (on_cpu != 0).any(dim=-1) & (on_gpu != 0).any(dim=-1)
     assert (both == (on_cpu != 0).any(dim=-1)).float().mean() > 0.98  # A rim of 1/255 may round either way.
-    torch.testing.assert_close(on_gpu[both], on_cpu[both], atol=1e-3, rtol=0)
+    assert_within(on_gpu[both], on_cpu[both], 1e-3)

@@ -118,5 +118,6 @@ def test_what_goes_wrong_is_told_in_the_panel_too(
     panel = pipeline.structure
     panel.observe.cb_hook(panel.observe)
     assert told(panel)[-1] == "The viewer's panel stays as it was: CUDA out of memory"
-    assert "CUDA out of memory" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "CUDA out of memory" in printed
     assert was_disabled(panel) == [True, False]

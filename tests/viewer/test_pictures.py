@@ -13,7 +13,10 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torch.testing import assert_close
 
+from helpers.closeness import assert_within_share
+from helpers.generators import seeded
 from helpers.small_scenes import camera, random_params
 from sadgs_ns.method.structure_tensor import FREQUENCY_CONSTANT, multiscale_structure_tensor
 from sadgs_ns.render.blending import blend
@@ -109,7 +112,7 @@ def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatc
         ellipses = maps.structure_ellipses(tensor, 0.4)
     assert ellipses.centers.tolist() == [[20.0, 20.0]]
     expected = torch.tensor([[2.5, 12.5]], dtype=torch.float64)
-    torch.testing.assert_close(ellipses.axes, expected, rtol=1e-3, atol=0)
+    assert_within_share(ellipses.axes, expected, 1e-3)
     tensor[:] = tensor[20, 20]
     drawn = maps.draw_ellipses(np.zeros((40, 40, 3), np.uint8), tensor, 0.4, size=(1120, 1120))
     cell = drawn[520:560, 520:560]  # 28 ellipses across: cells of 40 px
@@ -120,7 +123,7 @@ def test_ellipses_are_drawn_where_and_as_they_lie(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (45, 30)])
 def test_images_of_any_size_can_be_drawn(size: tuple[int, int]):
-    image = torch.rand((*size, 3), generator=torch.Generator().manual_seed(0))
+    image = torch.rand((*size, 3), generator=seeded(0))
     tensor = structure_tensor(image)
     actual = maps.draw_ellipses(color_scales.to_picture(image), tensor, 0.75, size).shape
     assert actual == (*size, 3)
@@ -167,7 +170,7 @@ def test_children_and_low_gaussians_are_seen_where_they_are():
 
 
 def test_only_children_get_new_colors():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     colors = maps.random_colors(4, generator)
     assert (colors.amax(dim=1) >= 0.5).all()
     assert len(colors.unique(dim=0)) == 4
@@ -201,19 +204,20 @@ def test_a_legend_has_the_scale_s_colours_and_numbers_as_an_image_in_its_text():
 
 def test_figures_are_written_whole_with_all_panels(tmp_path: Path):
     panels = [Panel("a", np.zeros((20, 30, 3), np.uint8), PERIOD), Panel("b", np.zeros((20, 30, 3), np.uint8))] * 2
-    color_scales.draw(tmp_path / "new" / "four.png", panels, columns=2)
+    color_scales.draw(tmp_path / "new/four.png", panels, columns=2)
     color_scales.draw(tmp_path / "one.png", panels[:1], columns=1)
-    assert [path.name for path in (tmp_path / "new").iterdir()] == ["four.png"]
-    with Image.open(tmp_path / "new" / "four.png") as four, Image.open(tmp_path / "one.png") as one:
+    names = [path.name for path in (tmp_path / "new").iterdir()]
+    assert names == ["four.png"]
+    with Image.open(tmp_path / "new/four.png") as four, Image.open(tmp_path / "one.png") as one:
         assert four.height > one.height > 0
 
 
 def test_blending_agrees_with_the_splatter_s_colors():
     params = {name: value.detach() for name, value in random_params(50).items()}
-    colors = torch.rand((50, 3), generator=torch.Generator().manual_seed(1))
+    colors = torch.rand((50, 3), generator=seeded(1))
     render, cover = blend(params, colors, view())
     ones, _ = blend(params, torch.ones(50, 3), view())
     expected = cover.expand(-1, -1, 3)
-    torch.testing.assert_close(ones, expected)
+    assert_close(ones, expected)
     assert render.shape == (48, 64, 3)
     assert (render <= ones + 1e-6).all()

@@ -37,7 +37,6 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
         sh_degree=model.config.sh_degree,
         is_black=model.config.background_color == "black",
         has_color_matrices=model.has_view_colors,
-        learns_color_matrices=model.color_matrices is not None,
         moves_cameras=model.poses is not None,
         single_process=model.world.is_single,
         size=(int(sizes.width.max()), int(sizes.height.max())),

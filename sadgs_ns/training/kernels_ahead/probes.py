@@ -18,7 +18,6 @@ from sadgs_ns.method.structure_tensor import multiscale_structure_tensor
 from sadgs_ns.render.activations import activate
 from sadgs_ns.render.rasterization import rasterize
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
-from sadgs_ns.training.step.color_matrices import correct_colors
 from sadgs_ns.training.step.nonfinite import MAX_GRADIENT
 from sadgs_ns.training.step.poses import corrected_views
 from sadgs_ns.training.step.row_adam import RowUpdate, empty_moments, move_rows
@@ -38,7 +37,6 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
-    learns_color_matrices: bool = False
     moves_cameras: bool = False  # Whether the cameras' poses have gradients
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
@@ -79,8 +77,6 @@ class Stages:
             "the loss of masked images": partial(self.loss, torch.float32),
             "activations": self.activations,
         }
-        if self.choice.has_color_matrices:
-            stages["colour matrices"] = self.colors
         if self.choice.moves_cameras:
             stages["poses"] = self.poses
         return stages
@@ -117,14 +113,6 @@ class Stages:
     def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
         predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()
         photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
-
-    def colors(self) -> None:
-        shape = self.views, _SIZE, _SIZE
-        renders = torch.zeros((*shape, 3), device=self.device, requires_grad=True)
-        alphas = torch.zeros((*shape, 1), device=self.device, requires_grad=True)
-        matrices = torch.eye(3, 4, device=self.device).repeat(self.views, 1, 1)
-        matrices.requires_grad_(self.choice.learns_color_matrices)
-        correct_colors(renders, alphas, matrices).sum().backward()
 
     def poses(self) -> None:
         table = torch.zeros((self.views, 6), device=self.device, requires_grad=True)

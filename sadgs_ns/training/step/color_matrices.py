@@ -9,8 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns.kernels import use_triton
-
 
 def anchored(
     matrices: Tensor,  # [V, 3, 4]
@@ -34,10 +32,6 @@ def correct_colors(
     """Apply affine maps (M | b) to the colours and alphas that `composite` returned: M c + α b. [C, H, W, 3]
 
     The offset b counts as much as the Gaussians cover: pixels that nothing covers stay black, and teach the matrices
-    nothing. Raises InputError if the views have more pixels than the Triton kernels can address (kernels/limits.py).
+    nothing.
     """
-    if use_triton(render):
-        from sadgs_ns.kernels.color_matrices import correct_colors as fused_correct_colors
-
-        return fused_correct_colors(render, alpha, matrices)
     return render @ matrices[:, None, :, :3].mT + alpha * matrices[:, None, None, :, 3]

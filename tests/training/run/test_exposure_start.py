@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,16 @@ import pytest
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.models.splatfacto import SH2RGB
+from numpy.testing import assert_allclose
 from PIL import ExifTags, Image
+from torch.testing import assert_close
 
 from benchmarks.evaluate import quality
 from benchmarks.exposures import with_gains
 from examples.drawn_scene.scene import describe_scene, write_scene
+from helpers.closeness import assert_within_share
 from helpers.gloo_ranks import run_ranks
+from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import parser_of, set_up
 from helpers.sharded_training import few_steps, set_up_together
 from helpers.short_runs import configure, nerfstudio_data, train
@@ -90,16 +93,17 @@ def test_photos_of_two_exposures_train_to_the_median_exposure(exposed: Path, tmp
 
 def test_gains_and_colours_of_points_are_those_that_were_drawn(exposed: Path, tmp_path: Path, capsys: Any):
     model = set_up(run_of(exposed, tmp_path)).pipeline.model
-    assert "Exposure, by the points' colours, varies by 0.7" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "Exposure, by the points' colours, varies by 0.7" in printed
     table = model.exposure
     assert table is not None
     assert model.gain_matrices is not None
-    np.testing.assert_allclose(table.stops, np.repeat(training_stops()[:, None], 3, axis=1), atol=0.1)
+    assert_allclose(table.stops, np.repeat(training_stops()[:, None], 3, axis=1), atol=0.1)
     expected = torch.exp2(table.stops / 2.4).float()
     actual = model.gain_matrices.diagonal(dim1=1, dim2=2)
-    torch.testing.assert_close(actual, expected)
+    assert_close(actual, expected)
     actual = model.gain_matrices[:, :, 3]
-    torch.testing.assert_close(actual, 0.055 * (expected - 1))
+    assert_close(actual, 0.055 * (expected - 1))
 
 
 def test_colours_of_points_are_brought_from_their_photos_mean_to_the_median_exposure(exposed: Path, tmp_path: Path):
@@ -124,7 +128,8 @@ def test_even_exposure_trains_without_gains_and_a_line_says_so(tmp_path: Path, c
     model = set_up(run_of(tmp_path / "room", tmp_path / "out")).pipeline.model
     assert model.exposure is None
     assert model.view_ids([0]) is None
-    assert "which is too little" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "which is too little" in printed
 
 
 def test_other_options_train_without_gains(exposed: Path, tmp_path: Path):
@@ -167,7 +172,7 @@ def test_added_photos_do_not_move_the_gains_of_earlier_ones(exposed: Path, tmp_p
     assert torch.equal(after.stops[kept], before.stops)
     shift = (after.stops[kept].mean(dim=1).numpy() - training_stops()[kept]).mean()
     actual = after.stops.mean(dim=1).numpy()
-    np.testing.assert_allclose(actual, training_stops() + shift, atol=0.06)
+    assert_allclose(actual, training_stops() + shift, atol=0.06)
 
 
 def exposures_together(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
@@ -208,14 +213,14 @@ def test_two_processes_train_with_the_same_gains_as_one(exposed: Path, tmp_path:
         assert torch.equal(result["matrices"], alone["matrices"])
         actual = torch.tensor(result["losses"][:4])
         expected = torch.tensor(alone["losses"][:4])
-        torch.testing.assert_close(actual, expected, rtol=1e-5, atol=0)
+        assert_within_share(actual, expected, 1e-5)
 
 
 def with_exif(folder: Path, name: str) -> NerfstudioDataParserConfig:
     """Data without points, whose photos' EXIF says that every other one was exposed half as long."""
     parser = nerfstudio_data(folder)
     path = parser.data / "transforms.json"
-    meta = json.loads(path.read_text())
+    meta = read_json(path)
     for index, frame in enumerate(meta["frames"]):
         drawn = parser.data / frame["file_path"]
         file = drawn.with_suffix(".jpg")
@@ -225,7 +230,7 @@ def with_exif(folder: Path, name: str) -> NerfstudioDataParserConfig:
         tags |= {ExifTags.Base.FNumber: 4.0, ExifTags.Base.ISOSpeedRatings: 100}
         exif.get_ifd(ExifTags.IFD.Exif).update(tags)
         Image.open(drawn).save(file, exif=exif, quality=98)
-    path.write_text(json.dumps(meta))
+    write_json(path, meta)
     return parser
 
 
@@ -252,4 +257,4 @@ def test_a_line_says_if_exif_and_points_disagree(exposed: Path, tmp_path: Path, 
     assert "By EXIF, exposure varies in a range of 3.0 stops, but by the points' colours of 1.5" in printed
     assert model.exposure is not None
     actual = model.exposure.stops.mean(dim=1)
-    np.testing.assert_allclose(actual, training_stops(), atol=0.1)
+    assert_allclose(actual, training_stops(), atol=0.1)

@@ -97,7 +97,8 @@ def hidden_pixels(trainer: SadgsTrainer, view: int) -> NDArray[np.bool_]:
 def test_judging_comes_before_what_changes_the_gaussians_and_ends_before_the_run():
     steps = sorted(judged_steps(3000, 1600))
     # Iterations are counted from 1.
-    assert [step + 2 for step in steps] == [400, 800, 1600, 2200]
+    actual = [step + 2 for step in steps]
+    assert actual == [400, 800, 1600, 2200]
     assert sorted(judged_steps(3000, 0)) == steps
     assert all(step < 9 for step in judged_steps(10, 9))
 
@@ -122,7 +123,8 @@ def test_the_run_keeps_a_mask_of_each_photo_in_which_something_moved(found: Sadg
     names = names_of(found)
     views = found.pipeline.views.moved.views
     written = sorted((found.base_dir / "masks").iterdir())
-    assert [path.name for path in written] == [names[view] for view in views]
+    actual = [path.name for path in written]
+    assert actual == [names[view] for view in views]
     for view, path in zip(views, written, strict=True):
         with Image.open(path) as mask:
             assert np.array_equal(~valid_pixels(mask), hidden_pixels(found, view))
@@ -184,7 +186,8 @@ def test_full_memory_ends_no_run(clean: Path, tmp_path: Path, monkeypatch, capsy
     put_region(trainer)
     trainer.train()
     assert trainer.pipeline.views.moved.views == [0]
-    assert "memory is too full to find what moved" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "memory is too full to find what moved" in printed
 
 
 @pytest.mark.hard_case("things that moved before photos of several sizes", "judged at each photo's own size")
@@ -251,5 +254,7 @@ def test_several_processes_find_what_one_finds(disturbed: tuple[Path, Any], foun
 
 
 def test_masks_lie_as_their_photos_do():
-    assert common_folder([Path("a/b/1.png"), Path("a/c/1.png")]) == Path("a")
-    assert common_folder([Path("a/b/1.png"), Path("a/b/2.png")]) == Path("a/b")
+    actual = common_folder([Path("a/b/1.png"), Path("a/c/1.png")])
+    assert actual == Path("a")
+    actual = common_folder([Path("a/b/1.png"), Path("a/b/2.png")])
+    assert actual == Path("a/b")

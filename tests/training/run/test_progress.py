@@ -176,14 +176,15 @@ def test_the_time_left_of_a_resumed_run_counts_its_own_iterations(
     resumed.callbacks.append(TrainingCallback(location, pass_time))
     resumed.train()
     iterations = [fields for fields in reported if fields["event"] == "iteration"]
-    assert [fields["step"] for fields in iterations] == [first, 16, 20]
+    steps = [fields["step"] for fields in iterations]
+    assert steps == [first, 16, 20]
     assert iterations[-1]["left"] == "6 s", "three iterations of two seconds"
     shown = re.findall(r"^(\d+) \(.+%\) .*", capsys.readouterr().out, re.MULTILINE)
     assert shown == ["16", "20"]
 
 
 def test_the_time_left_is_within_30_percent_on_all_captures_whose_times_were_kept():
-    results = Path(__file__).parents[3] / "docs" / "results"
+    results = Path(__file__).parents[3] / "docs/results"
     rows = [
         json.loads(line)
         for name in ("beside-splatfacto", "peers-ours")
@@ -289,7 +290,8 @@ def test_a_run_says_its_progress_and_what_can_be_done_with_it(
     assert evaluate[0] == "ns-eval"
     assert tyro.cli(ComputePSNR, args=evaluate[1:]).load_config == run / "config.yml"
     assert to_ply[0] == "sadgs-export"
-    assert export.main(to_ply[1:]) == 0
+    status = export.main(to_ply[1:])
+    assert status == 0
     assert (run / "splat.ply").is_file()
 
 
@@ -308,6 +310,7 @@ def test_a_run_on_the_cpu_says_that_it_is_slow_and_what_to_do_beside_other_work(
 ):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     set_up(config)
-    assert f"{cpu_notice(2)}\n" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"{cpu_notice(2)}\n" in printed
     assert "put OMP_NUM_THREADS=1 before the command" in cpu_notice(2)
     assert "OMP_NUM_THREADS" not in cpu_notice(1)

@@ -40,6 +40,7 @@ from nerfstudio.utils import writer
 from examples.drawn_scene.scene import SPARSE_FOLDER
 from helpers import forked_python, short_runs
 from helpers.kill_and_resume import configure, differences, set_up
+from helpers.refusals import refusal
 from helpers.small_scenes import ITERATIONS
 from sadgs_ns.data.cameras import camera_positions
 from sadgs_ns.errors import InputError, WriteError
@@ -92,7 +93,8 @@ def kill_and_resume(*arguments: object) -> str:
 def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
     sizes = ("--kills", 4, "--iterations", 24, "--save-every", 4, "--width", 48, "--views", 10)
     printed = kill_and_resume(tmp_path, *sizes)
-    assert re.findall(r"kill \d: .*, (.*), iteration .*: exit -9", printed) == [
+    actual = re.findall(r"kill \d: .*, (.*), iteration .*: exit -9", printed)
+    assert actual == [
         "within a step",
         "after a split",
         "saving",
@@ -102,13 +104,14 @@ def test_a_run_killed_in_four_places_ends_bitwise_equal_to_one_that_nothing_dist
 
 
 @pytest.mark.hard_case(
-    "ten kills in 300 iterations (slow): two in each of those places, one after a step and one from outside at "
+    "ten kills in 90 iterations (slow): two in each of those places, one after a step and one from outside at "
     "a random time",
     "the same; nothing is left over",
 )
 @pytest.mark.slow
 def test_a_run_killed_ten_times_ends_bitwise_equal_to_one_that_nothing_disturbed(tmp_path: Path):
-    printed = kill_and_resume(tmp_path, "--kills", 10)
+    sizes = ("--kills", 10, "--iterations", 90, "--save-every", 6, "--width", 48, "--views", 10)
+    printed = kill_and_resume(tmp_path, *sizes)
     assert printed.count("exit -9") == 10
     assert "bitwise equal; left over: []" in printed
 
@@ -214,7 +217,7 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     command += ["--max-num-iterations", str(iterations), "--steps-per-save", "5", "--vis", "tensorboard"]
     command += ["--pipeline.model.strategy.refine-stop-iter", "0", "--machine.device-type", "cpu"]
     command += ["colmap", "--data", str(scene), "--colmap-path", str(SPARSE_FOLDER), "--downscale-factor", "1"]
-    folder = tmp_path / "a run" / "sadgs" / "first" / "nerfstudio_models"
+    folder = tmp_path / "a run/sadgs/first/nerfstudio_models"
     files = tmp_path / "output", tmp_path / "errors"
     program = forked_python.NS_TRAIN.format(command)  # It does not matter where pip has put the script ns-train.
     process = forked_python.start(forked_python.into_files, files, program, dict(os.environ))
@@ -238,7 +241,8 @@ def test_ctrl_c_on_ns_train_prints_the_command_that_resumes_it(
     assert words == ["ns-train", "sadgs", "--load-config", str(folder.with_name("config.yml"))]
     resume(tyro.cli(AnnotatedBaseConfigUnion, args=words[1:]))  # in this process, which has imported everything
     assert f"Resuming after step {done - 1} of {path}" in capsys.readouterr().out
-    assert [p.name for p in folder.iterdir()] == [f"step-{iterations - 1:09d}.ckpt"]
+    names = [p.name for p in folder.iterdir()]
+    assert names == [f"step-{iterations - 1:09d}.ckpt"]
 
 
 @pytest.fixture
@@ -271,7 +275,8 @@ def test_an_interrupt_within_a_step_waits_for_its_end_and_resumes_to_the_same_mo
     with pytest.raises(SystemExit) as stopped:
         trainer.train()
     assert stopped.value.code == 128 + number
-    assert [signal.getsignal(n) for n in SIGNALS] == handlers
+    actual = [signal.getsignal(n) for n in SIGNALS]
+    assert actual == handlers
     assert checkpoints(trainer) == ["step-000000004.ckpt"]
     line = one_line(capsys.readouterr().out, number.name)
     assert line == (
@@ -495,7 +500,8 @@ def test_an_interrupt_while_paused_before_the_first_iteration_leaves_nothing(
         trainer.train()
     timer.join()
     assert stopped.value.code == 130
-    assert "before an iteration was done; the same command starts again" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "before an iteration was done; the same command starts again" in printed
     assert checkpoints(trainer) == []
 
 
@@ -521,7 +527,8 @@ def test_an_interrupt_after_the_last_iteration_ends_a_finished_run_without_an_er
     trainer.train()
     assert calls
     assert checkpoints(trainer) == [f"step-{ITERATIONS - 1:09d}.ckpt"]
-    assert "SIGINT" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "SIGINT" not in printed
 
 
 @pytest.mark.hard_case("a second Ctrl-C", "stops at once, as nerfstudio does; the previous checkpoint stays")
@@ -672,7 +679,7 @@ def test_a_checkpoint_goes_on_with_more_or_fewer_views_of_its_world_alone(
     if goes_on:
         assert set_up(config)._start_step == ITERATIONS
     else:
-        with pytest.raises(InputError, match=r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
+        with refusal(r"of its 8 cameras \(001\.png, …\) none stand where one of these 8 \("):
             set_up(config)
 
 
@@ -700,7 +707,8 @@ def test_a_resumed_run_keeps_the_length_that_was_derived_unless_another_is_asked
     config.pipeline.effort = 1.0
     config.max_num_iterations = 7
     config.pipeline.views_per_iteration = 3
-    assert length_of(set_up(config)) == Schedule(iterations=7, views_per_iteration=3)
+    actual = length_of(set_up(config))
+    assert actual == Schedule(iterations=7, views_per_iteration=3)
 
 
 @pytest.mark.hard_case(
@@ -717,12 +725,12 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
     config.output_dir = tmp_path / "resumed"
     assert set_up(config)._start_step == 2
     config.pipeline.model.color_model = "none"
-    with pytest.raises(InputError, match=r"It optimized color_matrices, too: set pipeline\.model\.color-model "):
+    with refusal(r"It optimized color_matrices, too: set pipeline\.model\.color-model "):
         set_up(config)
     config.pipeline.model.color_model = "affine"
     parser: Any = config.pipeline.datamanager.dataparser
     config.pipeline.datamanager.dataparser = dataclasses.replace(parser, eval_mode="all")
-    with pytest.raises(InputError, match=r"\S+color_matrices is for 8 training views, and there are 10: set the"):
+    with refusal(r"\S+color_matrices is for 8 training views, and there are 10: set the"):
         set_up(config)
 
 
@@ -735,7 +743,8 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     pipeline = trainer.pipeline
     known = [path.name for path in pipeline.datamanager.train_dataset.image_filenames]
     positions = camera_positions(pipeline.datamanager.train_dataset.cameras)
-    assert "same cameras" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "same cameras" not in printed
     files: Any = trainer.pipeline.datamanager.train_dataset.image_filenames
     files[:] = [path.with_name(f"of_another_{path.name}") for path in files]
     check_same_capture(pipeline, known, positions)
@@ -745,7 +754,8 @@ def test_images_with_other_names_at_the_same_cameras_are_told_of(
     )
     files[:] = [path.with_name(path.name.removeprefix("of_another_")).with_suffix(".jpg") for path in files]
     check_same_capture(pipeline, known, positions)
-    assert "same cameras" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "same cameras" not in printed
 
 
 # --- the cap that the device's memory gives ---
@@ -866,7 +876,8 @@ def test_damaged_checkpoints_alone_are_one_sentence(
     assert message.startswith(str(folder / "step-000000002.ckpt"))
     assert message.endswith("or train from scratch.")
     assert "\n" not in message
-    assert "Going on" not in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "Going on" not in printed
 
 
 @pytest.mark.hard_case(

@@ -106,7 +106,8 @@ def test_late_rates_that_are_constant_by_hand_stay_so_with_any_number_of_views(c
     for views in (1, 2, 4):
         config.pipeline.views_per_iteration = views
         schedulers = set_up(config).optimizers.schedulers
-        assert schedulers["opacities"].lr_lambdas[0](ITERATIONS) == pytest.approx(1.0)
+        actual = schedulers["opacities"].lr_lambdas[0](ITERATIONS)
+        assert actual == pytest.approx(1.0)
         assert "features_dc" not in schedulers
 
 

@@ -12,13 +12,14 @@ import torch
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.models.splatfacto import SH2RGB
 from PIL import Image
+from torch.testing import assert_close
 
 from examples.drawn_scene.scene import room_surfaces
 from helpers.kill_and_resume import set_up
+from helpers.refusals import refusal
 from helpers.short_runs import TRAIN_VIEWS, configure, nerfstudio_data, train
 from helpers.small_scenes import HEIGHT, POINTS, WIDTH
 from sadgs_ns.data.run_frame import points_in_the_run
-from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.stereo import depth_maps
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training import datamanager, pipeline, presets
@@ -193,12 +194,12 @@ def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
     assert len(paths.points) > 0
     for name, value in vars(paths).items():
         actual = getattr(started.strategy_state["camera_paths"], name)
-        torch.testing.assert_close(actual, value, rtol=0, atol=0)
+        assert_close(actual, value, rtol=0, atol=0)
 
 
 def test_a_negative_number_of_points_is_refused(config: Any):
     config.pipeline.model.stereo_points = -1
-    with pytest.raises(InputError, match=r"^pipeline\.model\.stereo_points must be in \[0, 10,000,000\], got -1\.$"):
+    with refusal(r"^pipeline\.model\.stereo_points must be in \[0, 10,000,000\], got -1\.$"):
         set_up(config)
 
 

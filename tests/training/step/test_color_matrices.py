@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
+from torch.testing import assert_close
 
-from sadgs_ns.kernels import triton_switched
-from sadgs_ns.training.step import color_matrices
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
-
-fused = pytest.importorskip("sadgs_ns.kernels.color_matrices", reason="Triton is not installed")
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def random_views(views: int, height: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Renderings [C, H, W, 3], opacities [C, H, W, 1], matrices [C, 3, 4] and gradients of the result [C, H, W, 3]."""
-    generator = torch.Generator().manual_seed(height)
+    generator = seeded(height)
     shapes = ((views, height, width, 3), (views, height, width, 1), (views, 3, 4), (views, height, width, 3))
     render, alpha, changes, upstream = (torch.rand(shape, generator=generator) for shape in shapes)
     return render, alpha, torch.eye(3, 4) + 0.3 * (changes - 0.5), upstream - 0.5
@@ -31,12 +28,8 @@ def reference(render: Tensor, alpha: Tensor, matrices: Tensor) -> Tensor:
     return linear + torch.einsum("ck,chw->chwk", matrices[..., 3], alpha[..., 0])
 
 
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
 @pytest.mark.parametrize("shape", [(1, 5, 7), (3, 33, 47)], ids=str)
-def test_colours_and_all_gradients_equal_the_float64_reference(
-    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int, int], kernels: bool
-):
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
+def test_colours_and_all_gradients_equal_the_float64_reference(shape: tuple[int, int, int]):
     *values, upstream = random_views(*shape)
     results = []
     for function, dtype in ((correct_colors, torch.float32), (reference, torch.float64)):
@@ -44,14 +37,10 @@ def test_colours_and_all_gradients_equal_the_float64_reference(
         corrected = function(*inputs)
         corrected.backward(upstream.to(DEVICE, dtype))
         results.append([corrected.detach().double(), *[value.grad.double() for value in inputs]])  # type: ignore[union-attr]
-    torch.testing.assert_close(*results, atol=2e-5, rtol=2e-5)
+    assert_close(*results, atol=2e-5, rtol=2e-5)
 
 
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
-def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
-    monkeypatch: pytest.MonkeyPatch, kernels: bool
-):
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
+def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other():
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 33, 47))
     results = []
     for learned in (True, False):
@@ -66,19 +55,8 @@ def test_matrices_that_are_not_learned_get_no_gradient_and_change_no_other(
         assert torch.equal(expected, found)
 
 
-def test_the_kernel_is_what_is_compared(monkeypatch: pytest.MonkeyPatch):
-    called: list[Any] = []
-    monkeypatch.setattr(fused, "correct_colors", lambda *values: called.append(values))
-    for on in (True, False):
-        with triton_switched(on):
-            correct_colors(*random_views(1, 2, 2)[:3])
-    assert len(called) == 1
-
-
-@pytest.mark.parametrize("kernels", [False, True], ids=["torch", "Triton"])
-def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.MonkeyPatch, kernels: bool):
+def test_what_is_not_drawn_stays_black_and_teaches_nothing():
     """A step without enough places in its tile lists draws nothing, which no matrix may learn to brighten."""
-    monkeypatch.setattr(color_matrices, "use_triton", lambda place: kernels)
     render, alpha, matrices, upstream = (value.to(DEVICE) for value in random_views(2, 6, 9))
     matrices.requires_grad_()
     corrected = correct_colors(torch.zeros_like(render), torch.zeros_like(alpha), matrices)
@@ -89,14 +67,14 @@ def test_what_is_not_drawn_stays_black_and_teaches_nothing(monkeypatch: pytest.M
 
 
 def test_the_mean_of_all_views_matrices_is_the_identity():
-    matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=torch.Generator().manual_seed(0))).requires_grad_()
+    matrices = (torch.eye(3, 4) + torch.randn((7, 3, 4), generator=seeded(0))).requires_grad_()
     every = anchored(matrices, torch.arange(7))
     actual = every.mean(dim=0)
     expected = torch.eye(3, 4)
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    assert_within(actual, expected, 1e-6)
     actual = every - every[:1]
     expected = (matrices - matrices[:1]).detach() + 0 * every
-    torch.testing.assert_close(actual, expected, atol=1e-6, rtol=0)
+    assert_within(actual, expected, 1e-6)
     chosen = anchored(matrices, torch.tensor([5, 2]))
     assert torch.equal(chosen, every[[5, 2]])
     chosen.sum().backward()
@@ -117,12 +95,12 @@ def test_a_gain_in_linear_light_is_an_affine_map_of_srgb_but_for_the_darkest():
         dark = 1.055 * light ** (1 / 2.4) - 0.055
         factor = gain ** (1 / 2.4)
         expected = factor * dark + 0.055 * (factor - 1)
-        torch.testing.assert_close(bright, expected, atol=1e-6, rtol=0)
+        assert_within(bright, expected, 1e-6)
 
 
 def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure():
     """One scene colour a pixel, and views that show it with gains of mean 1: both are found, up to no common factor."""
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     truth = 0.1 + 0.6 * torch.rand((1, 8, 8, 3), generator=generator)
     gains = torch.tensor([0.6, 0.8, 1.0, 1.2, 1.4])
     scene = torch.nn.Parameter(torch.full_like(truth, 0.4))
@@ -137,7 +115,7 @@ def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure()
         shown = correct_colors(scene, alpha, anchored(matrices, torch.tensor([view])))
         (shown - gains[view] * truth).square().mean().backward()
         optimizer.step()
-    torch.testing.assert_close(scene.detach(), truth, atol=0.02, rtol=0)
+    assert_within(scene.detach(), truth, 0.02)
     learned = correct_colors(truth.expand(5, -1, -1, -1), alpha, anchored(matrices, torch.arange(5)).detach())
     expected = gains[:, None, None, None] * truth
-    torch.testing.assert_close(learned, expected, atol=0.03, rtol=0)
+    assert_within(learned, expected, 0.03)

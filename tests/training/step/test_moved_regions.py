@@ -51,8 +51,10 @@ def test_what_a_given_mask_hides_stays_hidden():
 
 def test_only_photos_whose_region_is_another_change():
     regions = MovedRegions()
-    assert regions.replace({1: REGION, 3: REGION}) == [1, 3]
-    assert regions.replace({1: REGION.clone(), 2: REGION}) == [2, 3]
+    actual = regions.replace({1: REGION, 3: REGION})
+    assert actual == [1, 3]
+    actual = regions.replace({1: REGION.clone(), 2: REGION})
+    assert actual == [2, 3]
     assert regions.views == [1, 2] and len(regions) == 2
     assert regions.replace({}) == [1, 2] and not len(regions)
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 from gsplat.strategy.ops import remove
 from torch import Tensor
+from torch.testing import assert_close
 
 from sadgs_ns import kernels
 from sadgs_ns.training.step.nonfinite import NonFiniteLog
@@ -109,7 +110,7 @@ def assert_same(one: Training, other: Training, tolerance: float = 0.0) -> None:
         if value.is_cuda or tolerance:
             value = value.to(DEVICE)
             known = known.to(DEVICE)
-            torch.testing.assert_close({name: value}, {name: known}, atol=max(tolerance, 1e-7), rtol=tolerance or 2e-6)
+            assert_close({name: value}, {name: known}, atol=max(tolerance, 1e-7), rtol=tolerance or 2e-6)
         else:
             assert torch.equal(value, known), name
     assert not expected
@@ -161,7 +162,8 @@ def test_gradients_that_are_not_finite_are_named_and_left_out():
     for training in trainings:
         for step, wrong in enumerate((None, torch.nan, 1e30, None)):
             training.step(step, wrong)
-        assert [step for step, _, _ in training.log.read()] == [1, 2]
+        actual = [step for step, _, _ in training.log.read()]
+        assert actual == [1, 2]
         for _, value in training.tensors():
             assert value.isfinite().all()
     apart, together, by_torch = trainings

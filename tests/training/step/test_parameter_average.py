@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import torch
 
+from helpers.closeness import assert_within
+from helpers.generators import seeded
 from sadgs_ns.training.step.parameter_average import RunningMean
 
 
 def test_the_mean_is_that_of_all_that_was_added_in_float64():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     iterates = [torch.randn((5, 3), generator=generator) for _ in range(40)]
     params = {"means": torch.nn.Parameter(iterates[0].clone())}
     average = RunningMean()
@@ -19,7 +21,7 @@ def test_the_mean_is_that_of_all_that_was_added_in_float64():
     average.move_to(params)
     expected = torch.stack(iterates).double().mean(0)
     actual = params["means"].detach().double()
-    torch.testing.assert_close(actual, expected, rtol=0, atol=1e-6)
+    assert_within(actual, expected, 1e-6)
     assert average.count == 0
     assert average.means == {}
 
@@ -50,7 +52,7 @@ def test_it_goes_on_from_a_checkpoint():
 
 
 def test_all_parameters_are_averaged_as_each_by_itself():
-    generator = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     shapes = {"means": (7, 3), "opacities": (7, 1), "features_rest": (7, 0, 3)}
     average = RunningMean()
     expected: dict[str, torch.Tensor] = {}

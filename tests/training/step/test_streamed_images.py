@@ -115,9 +115,11 @@ def test_processes_that_decode_what_they_composite_train_as_if_each_had_all_imag
         assert len(result["under way"]) <= 2 + 2 * views
     own = [result["own"] for result in of_tier["compressed"]]
     for step, *parts in zip(of_tier["compressed"][0]["steps"], *own, strict=True):
-        assert {index for part in parts for index in part} == set(step)
+        actual = {index for part in parts for index in part}
+        assert actual == set(step)
         if views == ranks:
-            assert [len(part) for part in parts] == [1] * ranks
+            actual = [len(part) for part in parts]
+            assert actual == [1] * ranks
 
 
 def train_until_an_image_is_lost(world: World, config: SadgsTrainerConfig, folder: Path) -> tuple[str, int]:
@@ -205,10 +207,12 @@ def test_decoded_images_stay_on_the_host_where_all_processes_have_room(monkeypat
     datamanager.config.cache_images = "cpu"
     monkeypatch.setattr(host, "available_host_bytes", lambda: 4.1 * image_bytes(datamanager))
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
+    actual = choose_image_storage(datamanager, torch.device("cpu"))
+    assert actual == ImageStorage("cpu")
     monkeypatch.setattr(host, "available_host_bytes", lambda: 0.0)
     monkeypatch.setenv("WORLD_SIZE", "1")  # One process keeps them where it is told to.
-    assert choose_image_storage(datamanager, torch.device("cpu")) == ImageStorage("cpu")
+    actual = choose_image_storage(datamanager, torch.device("cpu"))
+    assert actual == ImageStorage("cpu")
 
 
 def test_processes_of_a_machine_share_the_cores(monkeypatch: pytest.MonkeyPatch):

@@ -67,7 +67,8 @@ def test_foreseen_steps_are_drawn_and_foreseeing_changes_no_order(total: int, nu
     expected = drawn_by(ViewSampler(total, 0), number, steps=60)
     sampler = ViewSampler(total, 0)
     for step in range(50):
-        assert sampler.foresee(number, step % 11) == expected[step : step + step % 11]
+        actual = sampler.foresee(number, step % 11)
+        assert actual == expected[step : step + step % 11]
         assert sampler.draw(number) == expected[step]
 
 
