@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,7 @@ DILATION = 1
 differences reach beyond outlines, too."""
 _SAMPLES = 200_000  # Pixels of all views of which median and spread are taken
 _POINTS = 1000  # Points on surfaces that tell which views see the same things
+_PIXELS_TOGETHER = 2**22  # Pixels that are compared at a time with those of neighbours, in arrays of 50 MB
 _FEWEST_PIXELS = 4  # Of a region in the smallest photos
 _CROSS = ndimage.generate_binary_structure(2, 1)  # A pixel and the four beside it
 _TINY = 1e-6
@@ -97,137 +99,212 @@ def working_size(
 
 
 def difference(
-    photo: Tensor,  # In [0, 1] [3, h, w]
-    drawn: Tensor,  # In [0, 1], with the photo's gain [3, h, w]
-    valid: Tensor,  # bool [h, w]
+    photos: Tensor,  # In [0, 1] [V, 3, h, w]
+    drawn: Tensor,  # In [0, 1], with the photos' gains [V, 3, h, w]
+    valid: Tensor,  # bool [V, h, w]
 ) -> Tensor:
-    """Difference between a small photo and its rendering, 0 where the photo is hidden. [h, w]
+    """Differences between small photos and their renderings, 0 where a photo is hidden. [V, h, w]
 
-    It is the distance of smoothed colours, at the shift of a pixel at most where they are closest, so that edges that
-    lie a little beside their place do not count; and its mean over a window.
+    They are the distances of smoothed colours, at the shift of a pixel at most where they are closest, so that edges
+    that lie a little beside their place do not count; and their means over a window.
     """
-    weight = valid.to(photo)[None]  # [1, h, w]
-    photo = _smoothed(photo, weight, 3)
+    weight = valid.to(photos)[:, None]  # [V, 1, h, w]
+    photos = _smoothed(photos, weight, 3)
     drawn = _smoothed(drawn, weight, 3)
-    height, width = valid.shape
-    padded = F.pad(drawn[None], (SHIFT, SHIFT, SHIFT, SHIFT), mode="replicate")
-    shifted = F.unfold(padded, 2 * SHIFT + 1).view(3, -1, height, width)
-    least = (photo[:, None] - shifted).square().mean(dim=0).amin(dim=0).sqrt()  # [h, w]
-    return _smoothed(least[None], weight, WINDOW)[0] * weight[0]
+    number, height, width = valid.shape
+    padded = F.pad(drawn, (SHIFT, SHIFT, SHIFT, SHIFT), mode="replicate")
+    shifted = F.unfold(padded, 2 * SHIFT + 1).view(number, 3, -1, height, width)
+    squares = (photos[:, :, None] - shifted).square().mean(dim=1)  # At each shift. [V, shifts, h, w]
+    least = squares.amin(dim=1, keepdim=True).sqrt()
+    return (_smoothed(least, weight, WINDOW) * weight)[:, 0]
 
 
 def structure(
-    photo: Tensor,  # In [0, 1] [3, h, w]
-    drawn: Tensor,  # In [0, 1], with the photo's gain [3, h, w]
-    valid: Tensor,  # bool [h, w]
+    photos: Tensor,  # In [0, 1] [V, 3, h, w]
+    drawn: Tensor,  # In [0, 1], with the photos' gains [V, 3, h, w]
+    valid: Tensor,  # bool [V, h, w]
 ) -> Tensor:
-    """Difference between a small photo and its rendering, each without its mean over a wide window. [h, w]
+    """Differences between small photos and their renderings, each without its mean over a wide window. [V, h, w]
 
     A shadow with soft edges, or light that changes, is in the means. Things have outlines.
     """
-    weight = valid.to(photo)[None]
-    return difference(photo - _smoothed(photo, weight, WIDE), drawn - _smoothed(drawn, weight, WIDE), valid)
+    weight = valid.to(photos)[:, None]
+    return difference(photos - _smoothed(photos, weight, WIDE), drawn - _smoothed(drawn, weight, WIDE), valid)
 
 
 def _smoothed(
-    image: Tensor,  # [C, h, w]
-    weight: Tensor,  # [1, h, w]
+    images: Tensor,  # [V, C, h, w]
+    weight: Tensor,  # [V, 1, h, w]
     side: int,  # px, odd
 ) -> Tensor:
-    """Weighted mean of an image over windows; 0 where a window has no weight. [C, h, w]"""
-    both = torch.cat([image * weight, weight])[None]
+    """Weighted means of images over windows; 0 where a window has no weight. [V, C, h, w]"""
+    both = torch.cat([images * weight, weight], dim=1)
     of_columns = F.avg_pool2d(both, (side, 1), 1, (side // 2, 0), count_include_pad=False)
-    sums = F.avg_pool2d(of_columns, (1, side), 1, (0, side // 2), count_include_pad=False)[0]
-    return sums[:-1] / sums[-1:].clamp_min(_TINY)
+    sums = F.avg_pool2d(of_columns, (1, side), 1, (0, side // 2), count_include_pad=False)
+    return sums[:, :-1] / sums[:, -1:].clamp_min(_TINY)
 
 
 def surface_points(views: Sequence[SmallView]) -> Tensor:
     """Return points of what the views draw, evenly over views and pixels, in world space. float64 [P, 3]"""
     of_each = max(_POINTS // len(views), 2)
     points = []
-    for view in views:
-        pixels = view.depth.numel()
+    for group in _groups(views):
+        depths = group.depth.flatten(1)  # [V, pixels]
+        pixels = depths.shape[1]
         every = max(pixels // of_each, 1)
-        chosen = torch.arange(every // 2, pixels, every, device=view.depth.device)
-        depth = view.depth.flatten()[chosen].double()
-        width = view.depth.shape[1]
+        chosen = torch.arange(every // 2, pixels, every, device=depths.device)
+        depth = depths[:, chosen].double()
+        width = group.depth.shape[2]
         x = chosen % width + 0.5
         y = torch.div(chosen, width, rounding_mode="floor") + 0.5
-        K = view.K.double()
-        rays = torch.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], torch.ones_like(depth)])  # [3, P]
-        to_world = view.viewmat.double().inverse()
-        places = to_world[:3, :3] @ (rays * depth) + to_world[:3, 3:]
-        points.append(places.T[depth > 0])
+        K = group.K.double()[:, :, :, None]  # [V, 3, 3, 1]
+        rays = torch.stack(
+            [(x - K[:, 0, 2]) / K[:, 0, 0], (y - K[:, 1, 2]) / K[:, 1, 1], torch.ones_like(depth)], dim=1
+        )
+        to_world = group.viewmat.double().inverse()
+        in_camera = rays * depth[:, None]  # [V, 3, P]
+        places = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]
+        points.append(places.mT[depth > 0])
     return torch.cat(points)
 
 
-def excess(view: SmallView, others: Sequence[SmallView]) -> Tensor:
-    """Difference of a view beyond those of its neighbours; NaN where too few of them see the point. [h, w]
+@dataclass(frozen=True)
+class _Group:
+    """Views of one size: their places among all views, and what `SmallView` has, stacked."""
+
+    members: list[int]
+    difference: Tensor  # [V, h, w]
+    depth: Tensor  # [V, h, w]
+    valid: Tensor  # bool [V, h, w]
+    viewmat: Tensor  # [V, 4, 4]
+    K: Tensor  # [V, 3, 3]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in px."""
+        height, width = self.depth.shape[1:]
+        return height, width
+
+    @cached_property
+    def place_of(self) -> dict[int, int]:
+        """Places in the group, by places among all views."""
+        return {index: place for place, index in enumerate(self.members)}
+
+    @cached_property
+    def planes(self) -> Tensor:
+        """Greatest difference near each pixel, depth, and 1 where the photo is valid. [V, 3, h, w]"""
+        near = F.max_pool2d(self.difference[:, None], WINDOW, 1, WINDOW // 2)[:, 0]
+        return torch.stack([near, self.depth, self.valid.to(near)], dim=1)
+
+
+def _groups(views: Sequence[SmallView]) -> list[_Group]:
+    """Stack the views of each size, which are then computed together: a view alone is too little work for a GPU."""
+    members: dict[tuple[int, ...], list[int]] = {}
+    for index, view in enumerate(views):
+        members.setdefault(tuple(view.depth.shape), []).append(index)
+    groups = []
+    for indices in members.values():
+        stacked = {}
+        for name in ("difference", "depth", "valid", "viewmat", "K"):
+            stacked[name] = torch.stack([getattr(views[index], name) for index in indices])
+        groups.append(_Group(indices, **stacked))
+    return groups
+
+
+def excesses(views: Sequence[SmallView], neighbours: Sequence[Sequence[int]]) -> list[Tensor]:
+    """Differences of views beyond those of their neighbours; NaN where too few of them see the point. [h, w] each
 
     A neighbour that sees a point, or looks through its place at something behind it, tells the point's difference. One
-    in which something nearer hides the point tells nothing.
+    in which something nearer hides the point tells nothing. `neighbours` are the places in `views` of each view's, at
+    most `NEIGHBOURS`.
     """
-    unknown = torch.full_like(view.difference, math.nan)
-    if len(others) < FEWEST_SEEING:
-        return unknown
-    told = _carried(view, others)  # NaN where one tells nothing. [N, h, w]
-    enough = told.isfinite().sum(dim=0) >= FEWEST_SEEING
-    enough &= view.valid
-    return torch.where(enough, view.difference - _upper(told), unknown)
+    groups = _groups(views)
+    found: dict[int, Tensor] = {}
+    for group in groups:
+        height, width = group.size
+        together = max(_PIXELS_TOGETHER // (NEIGHBOURS * height * width), 1)
+        for start in range(0, len(group.members), together):
+            part = slice(start, start + together)
+            indices = group.members[part]
+            told = _carried(group, part, [neighbours[index] for index in indices], groups)
+            enough = told.isfinite().sum(dim=1) >= FEWEST_SEEING
+            enough &= group.valid[part]
+            beyond = group.difference[part] - _upper(told)
+            found |= zip(indices, torch.where(enough, beyond, math.nan), strict=True)
+    return [found[index] for index in range(len(views))]
 
 
 def _upper(
-    values: Tensor,  # NaN where unknown [N, h, w]
+    values: Tensor,  # NaN where unknown [V, N, h, w]
 ) -> Tensor:
-    """Return the quantile `CONFIRMING` of known values, the higher of two; it has no meaning where none is. [h, w]"""
+    """Return the quantile `CONFIRMING` of known values, the higher of two; no meaning where none is. [V, h, w]"""
     known = values.isfinite()
-    count = known.sum(dim=0)  # [h, w]
-    ordered = torch.where(known, values, math.inf).sort(dim=0).values
+    count = known.sum(dim=1, keepdim=True)  # [V, 1, h, w]
+    ordered = torch.where(known, values, math.inf).sort(dim=1).values
     rank = (CONFIRMING * (count - 1)).ceil().long().clamp_min(0)
-    return ordered.gather(0, rank[None])[0]
+    return ordered.gather(1, rank)[:, 0]
 
 
-def _carried(view: SmallView, others: Sequence[SmallView]) -> Tensor:
-    """Return the differences of other views at the points of a view, NaN where they tell nothing. [N, h, w]"""
-    height, width = view.depth.shape
-    device = view.depth.device
-    x = torch.arange(width, device=device) + 0.5
-    y = torch.arange(height, device=device)[:, None] + 0.5
-    ray_x = (x - view.K[0, 2]) / view.K[0, 0]
-    ray_y = (y - view.K[1, 2]) / view.K[1, 1]
-    viewmats = torch.stack([other.viewmat for other in others]).double()
-    Ks = torch.stack([other.K for other in others])
-    to = (viewmats @ view.viewmat.double().inverse()).float()[:, :3, :, None, None]  # [N, 3, 4, 1, 1]
-    # No matrix product, since TF32 would round it to 10 bits.
-    turned = to[:, :, 0] * ray_x + to[:, :, 1] * ray_y + to[:, :, 2]  # [N, 3, h, w]
-    point = turned * view.depth + to[:, :, 3]
-    depth = point[:, 2].clamp_min(_TINY)  # [N, h, w]
-    focal = Ks.diagonal(dim1=1, dim2=2)[:, :2, None, None]  # [N, 2, 1, 1]
-    place = focal * point[:, :2] / depth[:, None] + Ks[:, :2, 2, None, None]  # px. [N, 2, h, w]
-    found = _read(others, place)  # [N, 3, h, w]
-    told, drawn, sees = found.unbind(dim=1)
-    # Where nothing is drawn, nothing hides the point.
-    known = (depth < HIDDEN_DEPTH * drawn) | (drawn == 0)
-    known &= (sees > 0) & (point[:, 2] > 0) & (view.depth > 0)
-    return torch.where(known, told, math.nan)
+def _carried(
+    group: _Group,
+    part: slice,  # V views of the group
+    neighbours: Sequence[Sequence[int]],  # Of each of them, its neighbours' places among all views
+    groups: Sequence[_Group],  # All views
+) -> Tensor:
+    """Return the differences of neighbours at the points of views.
+
+    NaN where they tell nothing, and where a view has fewer than `NEIGHBOURS`. [V, NEIGHBOURS, h, w]
+    """
+    height, width = group.size
+    depth = group.depth[part][:, None]  # [V, 1, h, w]
+    to_world = group.viewmat[part].double().inverse()
+    K = group.K[part]
+    x = torch.arange(width, device=depth.device) + 0.5
+    y = torch.arange(height, device=depth.device) + 0.5
+    ray_x = ((x - K[:, 0, 2, None]) / K[:, 0, 0, None])[:, None, :]  # [V, 1, w]
+    ray_y = ((y - K[:, 1, 2, None]) / K[:, 1, 1, None])[:, :, None]  # [V, h, 1]
+    told = torch.full((len(K), NEIGHBOURS, height, width), math.nan, device=depth.device)
+    for other in groups:
+        views = []  # Places in the part of the views of pairs with a neighbour in the other group
+        slots = []  # Places of these neighbours among those of their views
+        members = []  # and in the other group
+        for view, row in enumerate(neighbours):
+            for slot, index in enumerate(row):
+                if index in other.place_of:
+                    views.append(view)
+                    slots.append(slot)
+                    members.append(other.place_of[index])
+        if not views:
+            continue
+        pairs = other.viewmat[members].double() @ to_world[views]
+        to = pairs.float()[:, :3, :, None, None]  # [pairs, 3, 4, 1, 1]
+        # No matrix product, since TF32 would round it to 10 bits.
+        turned = to[:, :, 0] * ray_x[views][:, None] + to[:, :, 1] * ray_y[views][:, None] + to[:, :, 2]
+        point = turned * depth[views] + to[:, :, 3]  # [pairs, 3, h, w]
+        far = point[:, 2].clamp_min(_TINY)  # [pairs, h, w]
+        of_other = other.K[members]
+        focal = of_other.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+        places = focal * point[:, :2] / far[:, None] + of_other[:, :2, 2, None, None]  # px. [pairs, 2, h, w]
+        value, drawn, sees = _read(other, members, places).unbind(dim=1)
+        # Where nothing is drawn, nothing hides the point.
+        known = (far < HIDDEN_DEPTH * drawn) | (drawn == 0)
+        known &= (sees > 0) & (point[:, 2] > 0) & (depth[views][:, 0] > 0)
+        told[views, slots] = torch.where(known, value, math.nan)
+    return told
 
 
 def _read(
-    views: Sequence[SmallView],
-    places: Tensor,  # In each view, in px [N, 2, h, w]
+    group: _Group,
+    members: Sequence[int],  # One view of the group for each of N pictures
+    places: Tensor,  # In px [N, 2, h, w]
 ) -> Tensor:
-    """Return the difference, the depth and 1 where the photo is valid, of each view at places in it. [N, 3, h, w]
+    """Return the difference, the depth and 1 where the photo is valid, of views at places in them. [N, 3, h, w]
 
     All are 0 outside of the picture. The greatest difference near the place counts, since depth is not exact.
     """
-    found = []
-    for view, place in zip(views, places, strict=True):
-        height, width = view.depth.shape
-        grid = torch.stack([place[0] * (2 / width) - 1, place[1] * (2 / height) - 1], dim=-1)
-        near = F.max_pool2d(view.difference[None], WINDOW, 1, WINDOW // 2)
-        planes = torch.stack([near[0], view.depth, view.valid.to(near)])[None]
-        found.append(F.grid_sample(planes, grid[None], mode="nearest", align_corners=False)[0])
-    return torch.stack(found)
+    height, width = group.size
+    grid = torch.stack([places[:, 0] * (2 / width) - 1, places[:, 1] * (2 / height) - 1], dim=-1)
+    return F.grid_sample(group.planes[members], grid, mode="nearest", align_corners=False)
 
 
 def spread(

@@ -14,11 +14,9 @@ from sadgs_ns.geometry import moved
 from sadgs_ns.geometry.moved import (
     SmallView,
     Spread,
-    difference,
-    excess,
+    excesses,
     region,
     spread,
-    structure,
     surface_points,
     working_size,
 )
@@ -42,6 +40,20 @@ def view_at(x: float, differing: Tensor | None = None, depth: float = WALL, vali
     if valid is None:
         valid = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     return SmallView(values, values.clone(), torch.full((HEIGHT, WIDTH), depth), valid, viewmat, K)
+
+
+def excess(view: SmallView, others: list[SmallView]) -> Tensor:
+    """The excess of a view beyond others."""
+    neighbours = [list(range(1, len(others) + 1)), *[[] for _ in others]]
+    return excesses([view, *others], neighbours)[0]
+
+
+def difference(photo: Tensor, drawn: Tensor, valid: Tensor) -> Tensor:
+    return moved.difference(photo[None], drawn[None], valid[None])[0]
+
+
+def structure(photo: Tensor, drawn: Tensor, valid: Tensor) -> Tensor:
+    return moved.structure(photo[None], drawn[None], valid[None])[0]
 
 
 def pixels(rows: slice, columns: slice) -> Tensor:
@@ -121,6 +133,33 @@ def test_too_few_views_and_hidden_pixels_are_no_evidence():
     assert bool(excess(view_at(0.0), [view_at(0.4)]).isnan().all())
     blind = view_at(0.4, valid=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
     assert bool(excess(view_at(0.0), [blind, view_at(-0.4)]).isnan().all())
+
+
+def cropped(view: SmallView, height: int, width: int) -> SmallView:
+    """The left upper part of a view."""
+    part = (slice(0, height), slice(0, width))
+    return SmallView(
+        view.difference[part], view.structure[part], view.depth[part], view.valid[part], view.viewmat, view.K
+    )
+
+
+def test_views_of_several_sizes_are_judged_together_as_each_is_alone(monkeypatch: pytest.MonkeyPatch):
+    positions = (-0.8, -0.4, 0.0, 0.4, 0.8)
+    views = [view_at(x, thing_on_the_wall(x)) for x in positions[:4]]
+    views.append(view_at(positions[4], pixels(*THING)))
+    for index in (1, 3):
+        views[index] = cropped(views[index], HEIGHT - 8, WIDTH - 12)
+    neighbours = [[other for other in range(5) if other != index] for index in range(5)]
+    neighbours[0] = []
+    together = excesses(views, neighbours)
+    monkeypatch.setattr(moved, "_PIXELS_TOGETHER", 1)
+    one_by_one = excesses(views, neighbours)
+    for index in range(5):
+        alone = excess(views[index], [views[other] for other in neighbours[index]])
+        assert_close(together[index], alone, equal_nan=True, rtol=0, atol=0)
+        assert_close(one_by_one[index], alone, equal_nan=True, rtol=0, atol=0)
+    assert together[0].isnan().all()
+    assert float(together[4][pixels(*THING)].nan_to_num(0.0).max()) == pytest.approx(0.3)
 
 
 def test_the_spread_is_that_of_most_pixels_whatever_a_few_are():

@@ -111,11 +111,13 @@ class MovedSearch:
             if not is_first:
                 continue
             size = (cameras.height, cameras.width)
-            for color, depth, viewmat, K in zip(colors, depths, cameras.viewmats, cameras.Ks, strict=True):
-                photo, valid = self._small_photo(next(photos), size)
-                difference = moved.difference(photo, color, valid)
-                structure = moved.structure(photo, color, valid)
-                views.append(SmallView(difference, structure, depth, valid, viewmat, K))
+            small = [self._small_photo(next(photos), size) for _ in indices]
+            small_photos = torch.stack([photo for photo, _ in small])
+            valid = torch.stack([where for _, where in small])
+            differences = moved.difference(small_photos, colors, valid)
+            structures = moved.structure(small_photos, colors, valid)
+            parts = (differences, structures, depths, valid, cameras.viewmats, cameras.Ks)
+            views += [SmallView(*of_view) for of_view in zip(*parts, strict=True)]
         return views
 
     def _batches(self) -> Iterator[list[int]]:
@@ -248,9 +250,7 @@ def verdict(views: Sequence[SmallView]) -> Verdict:
         sizes = points.new_tensor([[view.depth.shape[1], view.depth.shape[0]] for view in views])
         chosen = choose_neighbours(viewmats, Ks, sizes, points, moved.NEIGHBOURS).tolist()
         neighbours = [[other for other in row if other >= 0] for row in chosen]
-    excesses = []
-    for view, row in zip(views, neighbours, strict=True):
-        excesses.append(moved.excess(view, [views[other] for other in row]))
+    excesses = moved.excesses(views, neighbours)
     limits = moved.spread(excesses)
     regions = {}
     for index, (view, values) in enumerate(zip(views, excesses, strict=True)):
