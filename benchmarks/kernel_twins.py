@@ -31,8 +31,8 @@ from sadgs_ns.training.step.nonfinite import leave_out_nonfinite
 if TYPE_CHECKING:  # Triton need not be installed.
     from sadgs_ns.kernels.tiles import PairCounts, PendingTiles, TileLists
 
-REFINED = {"pipeline.model.poses": "refined", "pipeline.model.color_model": "affine"}
-"""Settings of a run that launches the kernels of poses and of colour matrices."""
+REFINED = {"pipeline.model.poses": "refined"}
+"""Settings of a run that launches the kernels of poses."""
 _MANY_STEPS = 1e9  # After so many updates Adam corrects no bias, and float32 does not change if 1 is added.
 
 

@@ -144,32 +144,8 @@ def _smoothed(
     return sums[:, :-1] / sums[:, -1:].clamp_min(_TINY)
 
 
-def surface_points(views: Sequence[SmallView]) -> Tensor:
-    """Return points of what the views draw, evenly over views and pixels, in world space. float64 [P, 3]"""
-    of_each = max(_POINTS // len(views), 2)
-    points = []
-    for group in _groups(views):
-        depths = group.depth.flatten(1)  # [V, pixels]
-        pixels = depths.shape[1]
-        every = max(pixels // of_each, 1)
-        chosen = torch.arange(every // 2, pixels, every, device=depths.device)
-        depth = depths[:, chosen].double()
-        width = group.depth.shape[2]
-        x = chosen % width + 0.5
-        y = torch.div(chosen, width, rounding_mode="floor") + 0.5
-        K = group.K.double()[:, :, :, None]  # [V, 3, 3, 1]
-        rays = torch.stack(
-            [(x - K[:, 0, 2]) / K[:, 0, 0], (y - K[:, 1, 2]) / K[:, 1, 1], torch.ones_like(depth)], dim=1
-        )
-        to_world = group.viewmat.double().inverse()
-        in_camera = rays * depth[:, None]  # [V, 3, P]
-        places = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]
-        points.append(places.mT[depth > 0])
-    return torch.cat(points)
-
-
 @dataclass(frozen=True)
-class _Group:
+class Group:
     """Views of one size: their places among all views, and what `SmallView` has, stacked."""
 
     members: list[int]
@@ -197,7 +173,7 @@ class _Group:
         return torch.stack([near, self.depth, self.valid.to(near)], dim=1)
 
 
-def _groups(views: Sequence[SmallView]) -> list[_Group]:
+def grouped(views: Sequence[SmallView]) -> list[Group]:
     """Stack the views of each size, which are then computed together: a view alone is too little work for a GPU."""
     members: dict[tuple[int, ...], list[int]] = {}
     for index, view in enumerate(views):
@@ -207,18 +183,45 @@ def _groups(views: Sequence[SmallView]) -> list[_Group]:
         stacked = {}
         for name in ("difference", "depth", "valid", "viewmat", "K"):
             stacked[name] = torch.stack([getattr(views[index], name) for index in indices])
-        groups.append(_Group(indices, **stacked))
+        groups.append(Group(indices, **stacked))
     return groups
 
 
-def excesses(views: Sequence[SmallView], neighbours: Sequence[Sequence[int]]) -> list[Tensor]:
+def surface_points(groups: Sequence[Group]) -> Tensor:
+    """Return points of what the views draw, evenly over views and pixels, in world space. float64 [P, 3]"""
+    num_views = sum(len(group.members) for group in groups)
+    of_each = max(_POINTS // num_views, 2)
+    points = []
+    for group in groups:
+        height, width = group.size
+        every = max(height * width // of_each, 1)
+        chosen = torch.arange(every // 2, height * width, every, device=group.depth.device)
+        depth = group.depth.flatten(1)[:, chosen].double()  # [V, P]
+        x = chosen % width + 0.5
+        y = torch.div(chosen, width, rounding_mode="floor") + 0.5
+        K = group.K.double()[:, :, :, None]  # [V, 3, 3, 1]
+        ray_x = (x - K[:, 0, 2]) / K[:, 0, 0]  # [V, P]
+        ray_y = (y - K[:, 1, 2]) / K[:, 1, 1]
+        in_camera = torch.stack([ray_x * depth, ray_y * depth, depth], dim=1)  # [V, 3, P]
+        to_world = group.viewmat.double().inverse()
+        places = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]
+        points.append(places.mT[depth > 0])
+    return torch.cat(points)
+
+
+def excesses(groups: Sequence[Group], neighbours: Sequence[Sequence[int]]) -> list[Tensor]:
     """Differences of views beyond those of their neighbours; NaN where too few of them see the point. [h, w] each
 
     A neighbour that sees a point, or looks through its place at something behind it, tells the point's difference. One
-    in which something nearer hides the point tells nothing. `neighbours` are the places in `views` of each view's, at
-    most `NEIGHBOURS`.
+    in which something nearer hides the point tells nothing.
+
+    Args:
+        groups: All views.
+        neighbours: Of each view, the places of its neighbours among all views, at most `NEIGHBOURS`.
+
+    Returns:
+        One for each view, in the order of all views.
     """
-    groups = _groups(views)
     found: dict[int, Tensor] = {}
     for group in groups:
         height, width = group.size
@@ -230,8 +233,9 @@ def excesses(views: Sequence[SmallView], neighbours: Sequence[Sequence[int]]) ->
             enough = told.isfinite().sum(dim=1) >= FEWEST_SEEING
             enough &= group.valid[part]
             beyond = group.difference[part] - _upper(told)
-            found |= zip(indices, torch.where(enough, beyond, math.nan), strict=True)
-    return [found[index] for index in range(len(views))]
+            for index, values in zip(indices, torch.where(enough, beyond, math.nan), strict=True):
+                found[index] = values
+    return [found[index] for index in range(len(neighbours))]
 
 
 def _upper(
@@ -246,10 +250,10 @@ def _upper(
 
 
 def _carried(
-    group: _Group,
+    group: Group,
     part: slice,  # V views of the group
     neighbours: Sequence[Sequence[int]],  # Of each of them, its neighbours' places among all views
-    groups: Sequence[_Group],  # All views
+    groups: Sequence[Group],  # All views
 ) -> Tensor:
     """Return the differences of neighbours at the points of views.
 
@@ -265,21 +269,15 @@ def _carried(
     ray_y = ((y - K[:, 1, 2, None]) / K[:, 1, 1, None])[:, :, None]  # [V, h, 1]
     told = torch.full((len(K), NEIGHBOURS, height, width), math.nan, device=depth.device)
     for other in groups:
-        views = []  # Places in the part of the views of pairs with a neighbour in the other group
-        slots = []  # Places of these neighbours among those of their views
-        members = []  # and in the other group
-        for view, row in enumerate(neighbours):
-            for slot, index in enumerate(row):
-                if index in other.place_of:
-                    views.append(view)
-                    slots.append(slot)
-                    members.append(other.place_of[index])
+        views, slots, members = _pairs(neighbours, other)
         if not views:
             continue
         pairs = other.viewmat[members].double() @ to_world[views]
         to = pairs.float()[:, :3, :, None, None]  # [pairs, 3, 4, 1, 1]
         # No matrix product, since TF32 would round it to 10 bits.
-        turned = to[:, :, 0] * ray_x[views][:, None] + to[:, :, 1] * ray_y[views][:, None] + to[:, :, 2]
+        turned_x = to[:, :, 0] * ray_x[views][:, None]
+        turned_y = to[:, :, 1] * ray_y[views][:, None]
+        turned = turned_x + turned_y + to[:, :, 2]  # [pairs, 3, h, w]
         point = turned * depth[views] + to[:, :, 3]  # [pairs, 3, h, w]
         far = point[:, 2].clamp_min(_TINY)  # [pairs, h, w]
         of_other = other.K[members]
@@ -288,13 +286,33 @@ def _carried(
         value, drawn, sees = _read(other, members, places).unbind(dim=1)
         # Where nothing is drawn, nothing hides the point.
         known = (far < HIDDEN_DEPTH * drawn) | (drawn == 0)
-        known &= (sees > 0) & (point[:, 2] > 0) & (depth[views][:, 0] > 0)
+        known &= sees > 0
+        known &= point[:, 2] > 0
+        known &= depth[views][:, 0] > 0
         told[views, slots] = torch.where(known, value, math.nan)
     return told
 
 
+def _pairs(neighbours: Sequence[Sequence[int]], other: Group) -> tuple[list[int], list[int], list[int]]:
+    """List the pairs of a view and a neighbour of it in a group, given the neighbours of each view.
+
+    Returns:
+        Of each pair the view, the neighbour's place among the view's, and its place in the group.
+    """
+    views = []
+    slots = []
+    members = []
+    for view, row in enumerate(neighbours):
+        for slot, index in enumerate(row):
+            if index in other.place_of:
+                views.append(view)
+                slots.append(slot)
+                members.append(other.place_of[index])
+    return views, slots, members
+
+
 def _read(
-    group: _Group,
+    group: Group,
     members: Sequence[int],  # One view of the group for each of N pictures
     places: Tensor,  # In px [N, 2, h, w]
 ) -> Tensor:
@@ -303,7 +321,9 @@ def _read(
     All are 0 outside of the picture. The greatest difference near the place counts, since depth is not exact.
     """
     height, width = group.size
-    grid = torch.stack([places[:, 0] * (2 / width) - 1, places[:, 1] * (2 / height) - 1], dim=-1)
+    x = places[:, 0] * (2 / width) - 1
+    y = places[:, 1] * (2 / height) - 1
+    grid = torch.stack([x, y], dim=-1)  # From −1 to 1 between the picture's borders. [N, h, w, 2]
     return F.grid_sample(group.planes[members], grid, mode="nearest", align_corners=False)
 
 

@@ -110,7 +110,7 @@ def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> 
     import pycolmap
 
     photos = folder / "photos"
-    model = folder / "scene/work/model"
+    model = folder / "scene" / "work/model"
     photos.mkdir(parents=True)
     model.mkdir(parents=True)
     reconstruction = pycolmap.Reconstruction()
@@ -125,7 +125,7 @@ def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> 
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view.rotation), view.translation)
         reconstruction.add_image_with_trivial_frame(image, pose)
     reconstruction.write(model)
-    write_json(folder / "scene/work/settings.json", {"model": "model"})
+    write_json(folder / "scene" / "work/settings.json", {"model": "model"})
     return folder / "scene", photos
 
 

@@ -596,10 +596,10 @@ def test_settings_that_an_earlier_version_wrote_are_read(
         "few": "4 of 10 photos registered", "trained": "8 iterations, 3 Gaussians",
     }  # fmt: skip
     checkpoint = out / "training/sadgs/run-10/nerfstudio_models/step-000000007.ckpt"
-    for path in (checkpoint, out / "scene/work/settings.json"):
+    for path in (checkpoint, out / "scene" / "work/settings.json"):
         path.parent.mkdir(parents=True)
     checkpoint.touch()
-    write_json(out / "scene/work/settings.json", scene)
+    write_json(out / "scene" / "work/settings.json", scene)
     write_json(out / "scene/transforms.json", {"frames": [{"file_path": name} for name in views]})
     write_json(out / "settings.json", settings)
     command = [str(photos), "-o", str(out), "--formats", "ply", "--max-size", "120"]

@@ -15,6 +15,7 @@ from sadgs_ns.geometry.moved import (
     SmallView,
     Spread,
     excesses,
+    grouped,
     region,
     spread,
     surface_points,
@@ -45,7 +46,7 @@ def view_at(x: float, differing: Tensor | None = None, depth: float = WALL, vali
 def excess(view: SmallView, others: list[SmallView]) -> Tensor:
     """The excess of a view beyond others."""
     neighbours = [list(range(1, len(others) + 1)), *[[] for _ in others]]
-    return excesses([view, *others], neighbours)[0]
+    return excesses(grouped([view, *others]), neighbours)[0]
 
 
 def difference(photo: Tensor, drawn: Tensor, valid: Tensor) -> Tensor:
@@ -151,9 +152,9 @@ def test_views_of_several_sizes_are_judged_together_as_each_is_alone(monkeypatch
         views[index] = cropped(views[index], HEIGHT - 8, WIDTH - 12)
     neighbours = [[other for other in range(5) if other != index] for index in range(5)]
     neighbours[0] = []
-    together = excesses(views, neighbours)
+    together = excesses(grouped(views), neighbours)
     monkeypatch.setattr(moved, "_PIXELS_TOGETHER", 1)
-    one_by_one = excesses(views, neighbours)
+    one_by_one = excesses(grouped(views), neighbours)
     for index in range(5):
         alone = excess(views[index], [views[other] for other in neighbours[index]])
         assert_close(together[index], alone, equal_nan=True, rtol=0, atol=0)
@@ -239,7 +240,7 @@ def test_a_region_goes_on_where_the_excess_is_unknown_if_the_pixels_differ_much(
 
 def test_points_lie_on_what_is_drawn():
     nothing = view_at(0.4, depth=0.0)
-    points = surface_points([view_at(0.0), nothing])
+    points = surface_points(grouped([view_at(0.0), nothing]))
     assert len(points) > 500
     actual = points[:, 2]
     expected = torch.full((len(points),), WALL, dtype=torch.float64)

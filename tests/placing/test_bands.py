@@ -208,7 +208,7 @@ def test_ordinary_photos_stay(shot: Draw, tmp_path: Path):
 def test_photos_that_a_scene_has_stay(tmp_path: Path):
     names = draw(tmp_path, thermal_drone)
     known = [name for name in names if "_T." in name][:2]
-    settings = tmp_path / "out/work/settings.json"
+    settings = tmp_path / "out" / "work/settings.json"
     settings.parent.mkdir(parents=True)
     write_json(settings, {"photos": known})
     found, _, told = look_into(tmp_path, tmp_path / "out")
@@ -219,7 +219,7 @@ def test_photos_that_a_scene_has_stay(tmp_path: Path):
 
 def test_thermal_images_that_are_added_to_thermal_ones_stay(tmp_path: Path):
     names = draw(tmp_path, all_thermal)
-    settings = tmp_path / "out/work/settings.json"
+    settings = tmp_path / "out" / "work/settings.json"
     settings.parent.mkdir(parents=True)
     write_json(settings, {"photos": names[:3]})
     actual = look_into(tmp_path, tmp_path / "out")

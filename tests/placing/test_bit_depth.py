@@ -151,7 +151,7 @@ def test_a_scene_of_an_earlier_version_is_as_dark_as_before(tmp_path: Path, take
     photos = write(tmp_path / "photos", a=stored(4095), b=stored(819), c=stored(1))
     command = [str(photos), str(tmp_path / "out")]
     assert main(command) == 0
-    settings = tmp_path / "out/work/settings.json"
+    settings = tmp_path / "out" / "work/settings.json"
     described = read_json(settings)
     assert described.pop("bit_depth") == 12
     write_json(settings, described)

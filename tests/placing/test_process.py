@@ -645,7 +645,7 @@ def test_linked_folders_are_followed_and_no_photo_is_read_twice(tmp_path: Path, 
     black(photos, "a.png", "sub/b.png")
     black(elsewhere, "c.png", "sub/d.png", "scene/images/e.png")
     (elsewhere / "scene/work").mkdir()
-    (elsewhere / "scene/work/settings.json").write_text("{}")
+    (elsewhere / "scene" / "work/settings.json").write_text("{}")
     for link, target in {
         photos / "a link": photos / "sub", photos / "day": elsewhere, photos / "sub/root": Path("/"),
         elsewhere / "sub/circle": elsewhere, elsewhere / "back": photos / "sub", photos / "gone": tmp_path / "no",
@@ -792,7 +792,7 @@ def test_photos_that_lie_on_their_side_by_exif_become_upright(tmp_path: Path):
         assert (columns[:, :35] == 255 * (not masked)).all()
         assert (columns[:, 45:-5] == 255).all()
     assert [frame["mask_path"] for frame in described["frames"] if frame["file_path"] == "images/02.png"]
-    with pycolmap.Database.open(tmp_path / "out/work/database.db") as opened:
+    with pycolmap.Database.open(tmp_path / "out" / "work/database.db") as opened:
         keypoints = [opened.read_keypoints(image.image_id) for image in opened.read_all_images()]
     assert sorted(found[:, 0].min() > WIDTH / 4 - 1 for found in keypoints) == [False] * 7 + [True] * 3
     found = check_nerfstudio(tmp_path / "out", ParserOptions())
@@ -869,7 +869,7 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
     shutil.copy(tmp_path / "images/a.jpg", tmp_path / "images/a (1).jpg")
     black(tmp_path / "earlier", "images/c.png")
     (tmp_path / "earlier/work").mkdir()
-    (tmp_path / "earlier/work/settings.json").write_text("{}")
+    (tmp_path / "earlier" / "work/settings.json").write_text("{}")
     found, masks, told = look_into(tmp_path, tmp_path / "out")
     assert found == sorted(files)
     assert masks == {"images/a.jpg": "images/a_mask.png"}
@@ -880,7 +880,7 @@ def test_what_is_no_photo_becomes_none(tmp_path: Path):
         "Left out as masks of no photo: 1, such as masks/none.png.",
     ]
     (tmp_path / "out/work").mkdir(parents=True)
-    write_json(tmp_path / "out/work/settings.json", {"photos": [*left, "images/b.jpg"]})
+    write_json(tmp_path / "out" / "work/settings.json", {"photos": [*left, "images/b.jpg"]})
     actual = look_into(tmp_path, tmp_path / "out")[0]
     expected = sorted({*left, *files} - {"images/a.jpg", "images/IMG_1.jpg"})
     assert actual == expected
@@ -1392,7 +1392,7 @@ def test_two_runs_do_not_disturb_each_other(tmp_path: Path, monkeypatch: pytest.
 
     monkeypatch.setattr("sadgs_ns.placing.place.make_model", run_another)
     assert main(command) == 130
-    assert not (tmp_path / "out/work/models").exists()
+    assert not (tmp_path / "out" / "work/models").exists()
     errors = capsys.readouterr().err
     assert f"another sadgs-process works on {tmp_path / 'out'}; wait for it, or stop it." in errors
 
@@ -1429,7 +1429,7 @@ def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path
 def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     (tmp_path / "out/work").mkdir(parents=True)
-    (tmp_path / "out/work/settings.json").write_text('{"source": ')
+    (tmp_path / "out" / "work/settings.json").write_text('{"source": ')
     status = main([str(photos), str(tmp_path / "out")])
     assert status == 2
     printed = capsys.readouterr().err

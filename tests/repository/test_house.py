@@ -27,8 +27,9 @@ USES = {
 }
 MAX_FLAT = 9
 MAX_LINES = 600
-NO_KERNELS = {"shared", "trial"}  # Files of `kernels` whose functions other files test
 """Most lines of a file of the package."""
+NO_KERNELS = {"shared", "trial"}
+"""Files of `kernels` whose functions are tested with other kernels, or by themselves."""
 
 
 def names_imported(path: Path) -> set[str]:

@@ -242,7 +242,8 @@ def common_folder(files: Sequence[Path]) -> Path:
 
 def verdict(views: Sequence[SmallView]) -> Verdict:
     """Judge views by each other."""
-    points = moved.surface_points(views)
+    groups = moved.grouped(views)
+    points = moved.surface_points(groups)
     neighbours = [[] for _ in views]
     if len(points):
         viewmats = torch.stack([view.viewmat for view in views]).double()
@@ -250,7 +251,7 @@ def verdict(views: Sequence[SmallView]) -> Verdict:
         sizes = points.new_tensor([[view.depth.shape[1], view.depth.shape[0]] for view in views])
         chosen = choose_neighbours(viewmats, Ks, sizes, points, moved.NEIGHBOURS).tolist()
         neighbours = [[other for other in row if other >= 0] for row in chosen]
-    excesses = moved.excesses(views, neighbours)
+    excesses = moved.excesses(groups, neighbours)
     limits = moved.spread(excesses)
     regions = {}
     for index, (view, values) in enumerate(zip(views, excesses, strict=True)):
