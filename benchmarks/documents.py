@@ -61,9 +61,18 @@ class Source:
             rows += map(json.loads, path.read_text("utf-8").splitlines())
         return rows
 
-    def lines(self, rows: str, scenes: Scenes, labels: Mapping[str, str], reference: str | None = None) -> list[Run]:
+    def groups(self, rows: str | Sequence[str]) -> table.Groups:
+        """The rows of a file, or of several, by scene and label."""
+        names = rows
+        if isinstance(names, str):
+            names = [names]
+        return table.groups(self.read(*names))
+
+    def lines(
+        self, rows: str | Sequence[str], scenes: Scenes, labels: Mapping[str, str], reference: str | None = None
+    ) -> list[Run]:
         """Of each scene, or capture with folds, a run for each label; the others are compared with `reference`."""
-        found = table.groups(self.read(rows))
+        found = self.groups(rows)
         runs = []
         for scene, folds in folds_of(scenes).items():
             base = []
@@ -88,7 +97,7 @@ class Source:
         scenes: Scenes = (),
     ) -> Change:
         """What changing from one label to another does to scenes, or to captures with folds."""
-        found = table.groups(self.read(*rows))
+        found = self.groups(rows)
         before, after = change
         old = []
         new = []
@@ -104,7 +113,7 @@ class Source:
 
     def sweep(self, rows: Sequence[str], labels: Mapping[str, str], scenes: Mapping[str, Sequence[str]]) -> str:
         """A setting a line."""
-        found = table.groups(self.read(*rows))
+        found = self.groups(rows)
         return table.of_sweep(found, labels, scenes)
 
     def kernels(self, rows: str) -> str:
@@ -139,14 +148,27 @@ class Source:
             points.append((run.name, here, *means))
         return [points]
 
-    def quality_drawn(self, rows: str, scenes: Sequence[str], labels: Mapping[str, str]) -> list[Any]:
-        """Arguments of `plots.quality`."""
-        found = table.groups(self.read(rows))
+    def quality_drawn(
+        self,
+        rows: str | Sequence[str],
+        scenes: Sequence[str],
+        labels: Mapping[str, str],
+        joined: Mapping[str, Sequence[str]] | None = None,
+        joined_scenes: Sequence[str] = (),
+    ) -> list[Any]:
+        """Arguments of `plots.quality`; `joined` names several labels of which some scenes have one line together."""
+        found = self.groups(rows)
+        joined = joined or {}
         named = []
         for scene in scenes:
             for label, name in labels.items():
                 named.append(((scene, name), table.group_of(found, scene, label)))
-        return [named]
+            if scene not in joined_scenes:
+                continue
+            for name, together in joined.items():
+                runs = [run for label in together for run in table.group_of(found, scene, label)]
+                named.append(((scene, name), runs))
+        return [named, list(joined)]
 
 
 def folds_of(scenes: Scenes) -> Mapping[str, Sequence[str]]:

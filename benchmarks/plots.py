@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +62,11 @@ def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 @_styled
-def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]]) -> Figure:
+def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]], joined: Collection[str] = ()) -> Figure:
     """PSNR, SSIM and LPIPS of scenes and labels against loop seconds, a row of panels a scene.
 
-    Runs that were measured on their way have lines.
+    Runs that were measured on their way have lines. Of the labels in `joined` the ends of runs of several settings have
+    one line together, in the order of the results.
     """
     groups = dict(results)
     scenes = list(dict.fromkeys(scene for scene, _ in groups))
@@ -74,7 +75,7 @@ def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]]) -> Figu
     grid = figure.subplots(len(scenes), len(METRICS), sharex="row", squeeze=False)
     for (scene, metric), axes in zip(itertools.product(scenes, METRICS), grid.flat, strict=True):
         here = {label: group for (where, label), group in groups.items() if where == scene}
-        _plot_runs(axes, here, metric, looks)
+        _plot_runs(axes, here, metric, looks, joined)
         _finish(axes, metric)
         if metric == "psnr":
             axes.set_title(scene)
@@ -91,19 +92,35 @@ def quality(results: Iterable[tuple[tuple[str, str], Sequence[Result]]]) -> Figu
     return figure
 
 
-def _plot_runs(axes: Axes, groups: Mapping[str, Sequence[Result]], metric: str, looks: Mapping[str, Any]) -> None:
+def _plot_runs(
+    axes: Axes, groups: Mapping[str, Sequence[Result]], metric: str, looks: Mapping[str, Any], joined: Collection[str]
+) -> None:
     """Plot a metric of one scene's runs by their labels: each seed, the mean, and the curve up to it."""
     ends = {}
     for label, group in groups.items():
-        ends[label] = _known([(mean(group, "loop_seconds"), mean(group, metric))])
+        if label in joined:
+            ends[label] = _ends_of_settings(group, metric)
+        else:
+            ends[label] = _known([(mean(group, "loop_seconds"), mean(group, metric))])
     for label, group in groups.items():
-        seeds = _known([(row.get("loop_seconds"), row.get(metric)) for row in group])
         look = looks[label]
+        if label in joined:
+            _plot(axes, ends[label], **look, markersize=4.5, linestyle=":")
+            continue
+        seeds = _known([(row.get("loop_seconds"), row.get(metric)) for row in group])
         if len(group) > 1:
             _plot(axes, seeds, **look, alpha=0.4, markersize=3.5, linestyle="")
         _plot(axes, ends[label], **look, linestyle="", zorder=3)
         curve = _without_beginning(_curve(group, metric), itertools.chain(*ends.values()), metric)
         _plot(axes, curve, **look, markersize=3.5)
+
+
+def _ends_of_settings(group: Sequence[Result], metric: str) -> Points:
+    """Return mean (seconds, metric) of the runs of each setting, the settings in their order."""
+    by_setting: dict[str, list[Result]] = {}
+    for row in group:
+        by_setting.setdefault(row["label"], []).append(row)
+    return _known((mean(rows, "loop_seconds"), mean(rows, metric)) for rows in by_setting.values())
 
 
 @_styled

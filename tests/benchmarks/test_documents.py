@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -191,6 +192,23 @@ def test_a_figure_is_drawn_from_its_rows_and_drawn_anew_only_when_they_change(
     assert path.read_bytes() != written
     assert digest is not None
     assert plots.digest_in(path) not in (digest, None)
+
+
+def test_runs_of_several_settings_have_one_line_in_the_scenes_that_are_named(tmp_path: Path):
+    rows = {
+        "runs.jsonl": [row("fox", "ours"), row("tree", "ours")],
+        "more.jsonl": [row("fox", "half", psnr=29.0, loop_seconds=5.0), row("tree", "half", loop_seconds=6.0)],
+    }
+    source = documents.Source(checkout(tmp_path, {}, rows) / documents.RESULTS, {})
+    arguments = source.quality_drawn(
+        list(rows), ["fox", "tree"], {"ours": "ours"}, joined={"both": ["half", "ours"]}, joined_scenes=["fox"]
+    )
+    panels = plots.quality(*arguments).axes
+    dotted = []
+    for place in (0, 3):  # The panels of PSNR, of fox and of tree
+        lines = [line for line in panels[place].lines if line.get_linestyle() == ":"]
+        dotted.append([np.asarray(line.get_xydata()).tolist() for line in lines])
+    assert dotted == [[[[5.0, 29.0], [10.0, 30.0]]], []]
 
 
 WRONG_FIGURES: dict[str, tuple[Any, str]] = {
