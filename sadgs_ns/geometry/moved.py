@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
 WORKING_SIDE = 400
@@ -55,7 +55,8 @@ _SAMPLES = 200_000  # Pixels of all views of which median and spread are taken
 _POINTS = 1000  # Points on surfaces that tell which views see the same things
 _PIXELS_TOGETHER = 2**22  # Pixels that are compared at a time with those of neighbours, in arrays of 50 MB
 _FEWEST_PIXELS = 4  # Of a region in the smallest photos
-_CROSS = ndimage.generate_binary_structure(2, 1)  # A pixel and the four beside it
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)  # A pixel and the four beside it
+_STRONG, _WEAK, _STRUCTURAL = 1, 2, 4  # Bits of `_marks`
 _TINY = 1e-6
 
 
@@ -342,6 +343,29 @@ def spread(
     return Spread(float(median), float(deviation))
 
 
+def candidates(
+    excesses: Sequence[Tensor],  # Of all views; NaN where unknown [h, w]
+    limits: Spread,
+) -> list[int]:
+    """Return the views that have enough strong pixels for a region.
+
+    They are counted together, since a GPU waits wherever a number is read.
+    """
+    if not len(excesses):
+        return []
+    counts = torch.stack([(values > limits.strong).sum() for values in excesses]).tolist()
+    chosen = []
+    for index, values in enumerate(excesses):
+        if counts[index] >= _smallest(values.numel()):
+            chosen.append(index)
+    return chosen
+
+
+def _smallest(num_pixels: int) -> float:
+    """Return how many strong pixels a region has at least, in a photo of so many pixels."""
+    return max(SMALLEST_SHARE * num_pixels, _FEWEST_PIXELS)
+
+
 def region(
     view: SmallView,
     values: Tensor,  # Excess of the view; NaN where unknown [h, w]
@@ -349,50 +373,73 @@ def region(
 ) -> NDArray[np.bool_] | None:
     """Return where something moved in a view; None if nothing did. bool [h, w]
 
-    A region is of connected pixels beyond the weak limit of which enough are beyond the strong one. Where the excess is
-    unknown, as before the sky, which has no depth, a region goes on over pixels that differ from the rendering by the
-    strong limit more than most of the view. It differs in structure, not in brightness alone. It is dilated, and has no
-    holes.
+    A region is of connected pixels beyond the weak limit of which enough are beyond the strong one. It differs in
+    structure, not in brightness alone. It is dilated, and has no holes.
     """
-    known = values.isfinite()
-    excess = torch.where(known, values, -math.inf)
-    strong = excess > limits.strong
-    smallest = max(SMALLEST_SHARE * strong.numel(), _FEWEST_PIXELS)
-    if int(strong.sum()) < smallest:
-        return None
-    usual = view.difference.median()
-    weak = excess > limits.weak
-    weak |= ~known & (view.difference > usual + limits.strong)
-    opened: Any = ndimage.binary_opening(weak.cpu().numpy(), _CROSS)
-    labels, number = _components(opened)
-    structural = strong & (view.structure > LEAST_EXCESS)
-    counts = np.bincount(labels[strong.cpu().numpy()], minlength=number + 1)
-    structural_counts = np.bincount(labels[structural.cpu().numpy()], minlength=number + 1)
-    is_region = (counts >= smallest) & (structural_counts >= STRUCTURAL_SHARE * counts)
+    marks = _marks(view, values, limits).cpu().numpy()
+    weak = (marks & _WEAK) // _WEAK
+    labels, number = _components(_opened(weak))
+    counts = np.bincount(labels[(marks & _STRONG) > 0], minlength=number)
+    structural_counts = np.bincount(labels[(marks & _STRUCTURAL) > 0], minlength=number)
+    is_region = (counts >= _smallest(marks.size)) & (structural_counts >= STRUCTURAL_SHARE * counts)
     is_region[0] = False  # Pixels that opening has removed
     if not is_region.any():
         return None
-    return _filled(_dilated(is_region[labels]))
+    return _filled(_dilated(is_region[labels].view(np.uint8)))
 
 
-def _components(pixels: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
-    """Number connected pixels from 1, 0 elsewhere [h, w], and return how many components there are."""
-    found: Any = ndimage.label(pixels)
-    labels, number = found
+def _marks(
+    view: SmallView,
+    values: Tensor,  # Excess of the view; NaN where unknown [h, w]
+    limits: Spread,
+) -> Tensor:
+    """Mark with a bit each which pixels are strong, weak, and strong and different in structure. uint8 [h, w]
+
+    Where the excess is unknown, as before the sky, which has no depth, those count as weak that differ from the
+    rendering by the strong limit more than most of the view: a region goes on over them.
+    """
+    known = values.isfinite()
+    strong = known & (values > limits.strong)
+    usual = view.difference.median()
+    beyond = view.difference > usual + limits.strong
+    weak = torch.where(known, values > limits.weak, beyond)
+    structural = strong & (view.structure > LEAST_EXCESS)
+    return _STRONG * strong.byte() + _WEAK * weak.byte() + _STRUCTURAL * structural.byte()
+
+
+def _components(
+    pixels: NDArray[np.uint8],  # 0 or 1 [h, w]
+) -> tuple[NDArray[np.int32], int]:
+    """Number connected pixels of 1 from 1, 0 elsewhere [h, w]; return how many numbers there are, 0 included."""
+    found: Any = cv2.connectedComponents(pixels, connectivity=4, ltype=cv2.CV_32S)
+    number, labels = found
     return labels, number
 
 
-def _dilated(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _opened(
+    pixels: NDArray[np.uint8],  # 0 or 1 [h, w]
+) -> NDArray[np.uint8]:
+    """Take away what is thinner than the cross. [h, w]"""
+    outside = (0.0,)
+    opened: Any = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, _CROSS, borderType=cv2.BORDER_CONSTANT, borderValue=outside)
+    return opened
+
+
+def _dilated(
+    pixels: NDArray[np.uint8],  # 0 or 1 [h, w]
+) -> NDArray[np.uint8]:
     """Let a region grow by `DILATION`. [h, w]"""
-    grown: Any = ndimage.binary_dilation(pixels, _CROSS, DILATION)
+    grown: Any = cv2.dilate(pixels, _CROSS, iterations=DILATION)
     return grown
 
 
-def _filled(pixels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _filled(
+    pixels: NDArray[np.uint8],  # 0 or 1 [h, w]
+) -> NDArray[np.bool_]:
     """Fill the holes of a region, which do not reach the picture's border. [h, w]"""
-    labels, number = _components(~pixels)
-    is_hole = np.ones(number + 1, np.bool_)
+    labels, number = _components((pixels == 0).view(np.uint8))
+    is_hole = np.ones(number, np.bool_)
     for border in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
         is_hole[border] = False
     is_hole[0] = False
-    return pixels | is_hole[labels]
+    return (pixels > 0) | is_hole[labels]

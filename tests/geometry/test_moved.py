@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
 from torch.testing import assert_close
 
@@ -14,6 +18,7 @@ from sadgs_ns.geometry import moved
 from sadgs_ns.geometry.moved import (
     SmallView,
     Spread,
+    candidates,
     excesses,
     grouped,
     region,
@@ -236,6 +241,63 @@ def test_a_region_goes_on_where_the_excess_is_unknown_if_the_pixels_differ_much(
     alike.difference[upper] = 0.0
     found = region(alike, values, LIMITS)
     assert found is not None and found[upper.numpy()].mean() < 0.5
+
+
+def slow_region(view: SmallView, values: Tensor, limits: Spread) -> NDArray[np.bool_]:
+    """What `region` finds, one component after another by scipy; all False if nothing moved. [h, w]"""
+    cross = ndimage.generate_binary_structure(2, 1)
+    known = values.isfinite().numpy()
+    excess = np.where(known, values.numpy(), -np.inf)
+    differing = view.difference.numpy() > float(view.difference.median() + limits.strong)
+    strong = excess > limits.strong
+    structural = strong & (view.structure.numpy() > moved.LEAST_EXCESS)
+    opened: Any = ndimage.binary_opening(np.where(known, excess > limits.weak, differing), cross)
+    components: Any = ndimage.label(opened, cross)
+    labels, number = components
+    found = np.zeros_like(known)
+    for label in range(1, number + 1):
+        component = labels == label
+        enough = max(moved.SMALLEST_SHARE * known.size, 4)
+        num_strong = int((component & strong).sum())
+        num_structural = int((component & structural).sum())
+        if num_strong >= enough and num_structural >= moved.STRUCTURAL_SHARE * num_strong:
+            found |= component
+    dilated: Any = ndimage.binary_dilation(found, cross, moved.DILATION)
+    filled: Any = ndimage.binary_fill_holes(dilated, cross)
+    return filled
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_regions_of_noise_are_those_of_scipy(seed: int):
+    random = seeded(seed)
+
+    def noise() -> Tensor:
+        """Squares of noise, of which each has another strength."""
+        coarse = torch.rand(HEIGHT // 10, WIDTH // 10, generator=random)
+        fine = torch.rand(HEIGHT, WIDTH, generator=random)
+        return 0.5 * coarse.repeat_interleave(10, 0).repeat_interleave(10, 1) * fine
+
+    view = view_at(0.0)
+    view = SmallView(noise(), noise(), view.depth, view.valid, view.viewmat, view.K)
+    values = noise()
+    values[: 2 * seed] = math.nan
+    values[noise() > 0.4] = math.nan
+    limits = Spread(0.02, 0.01)
+    expected = slow_region(view, values, limits)
+    found = region(view, values, limits)
+    assert expected.any()
+    assert found is not None
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_only_views_with_enough_strong_pixels_are_candidates():
+    few = torch.zeros(HEIGHT, WIDTH)
+    few[0, :7] = 0.3  # A region has at least .3 % of 2,400 pixels.
+    enough = few.clone()
+    enough[0, 7] = 0.3
+    unknown = torch.full((HEIGHT, WIDTH), math.nan)
+    assert candidates([few, enough, unknown], LIMITS) == [1]
+    assert candidates([], LIMITS) == []
 
 
 def test_points_lie_on_what_is_drawn():

@@ -254,10 +254,10 @@ def verdict(views: Sequence[SmallView]) -> Verdict:
     excesses = moved.excesses(groups, neighbours)
     limits = moved.spread(excesses)
     regions = {}
-    for index, (view, values) in enumerate(zip(views, excesses, strict=True)):
-        region = moved.region(view, values, limits)
+    for index in moved.candidates(excesses, limits):
+        region = moved.region(views[index], excesses[index], limits)
         if region is not None:
-            regions[index] = torch.from_numpy(region.astype(np.uint8)).to(values.device)
+            regions[index] = torch.from_numpy(region.view(np.uint8)).to(points.device)
     return Verdict(list(views), excesses, limits, regions)
 
 
