@@ -245,7 +245,7 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
     (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
     (data / "other").mkdir()
     (data / "a clip.MP4").touch()
-    makes = f"`sadgs-process '{data}/a clip.MP4' FOLDER` makes one of it, and `sadgs` a splat."
+    makes = f"`sadgs-process '{data}/a clip.MP4' FOLDER` makes a capture of it, and `sadgs` makes a splat."
     for folder, sentence in (
         (data / "images", f"{data}/images is a part of the capture {data}: give --data that folder."),
         (data / SPARSE_FOLDER, f"{data}/sparse/0 is a part of the capture {data}: give --data that folder."),

@@ -131,7 +131,7 @@ def _no_folder(data: Path) -> str:
         return f"{data} does not exist: give --data the folder of a capture."
     if data.suffix.lower() in VIDEO_SUFFIXES:
         command = f"sadgs-process {shlex.quote(str(data))} FOLDER"
-        return f"{data} is a video and no capture: `{command}` makes one of it, and `sadgs` a splat."
+        return f"{data} is a video and no capture: `{command}` makes a capture of it, and `sadgs` makes a splat."
     return f"{data} is a file: give --data the folder of a capture."
 
 
