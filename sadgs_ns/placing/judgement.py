@@ -3,9 +3,9 @@
 Photos without parallax, or by lenses that the camera model does not fit, may all register and still give a wrong model.
 Sound captures keep far from the limits below. Ten real ones have angles of view of 35 to 79°, focal lengths that differ
 by at most 8 %, 116 points or more in the median photo, 5° or more between two rays to the median point, and shifts of
-1.4 % or more; two placings of those that few points hold together differ by at most 1.7 %. Of photos by a camera that
-turns on the spot, COLMAP often makes a model with large angles between rays, but too narrow a view; the shift alone
-tells it.
+1.4 % or more; fourteen have tilts of 7.5° or less. Two placings of those that few points hold together differ by at
+most 1.7 %. Of photos by a camera that turns on the spot, COLMAP often makes a model with large angles between rays, but
+too narrow a view; the shift alone tells it.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pycolmap
+
+from sadgs_ns.data.level import LARGEST_TILT, tilt
 
 _SHARE = 0.2  # Share of the photos whose angle of view must be impossible, because single photos do little harm
 _POINTS = 2000  # Least number of points that parallax is measured at, spread over all; twice as many at most
@@ -37,6 +39,7 @@ class Measures:
     observations: float  # Points that the median photo shows
     parallax: float  # Largest angle in degrees between two rays to a point, of the median point
     shift: float  # What turning leaves unexplained of the way of points between photos, as a share of the longer side
+    tilt: float = math.nan  # How far photos are turned about their viewing axes, in degrees, as of `level.tilt`
     disagreement: float = math.nan
     """How far points move between two placings of the photos with other samples, as a share of the longer side. The two
     are the most alike of up to three; NaN if there is one."""
@@ -87,6 +90,14 @@ def _turned(shift: float) -> str:
     return f"the photos look as if the camera had turned on the spot, to {100 * shift:.2f} % of their size: {_MOVE}"
 
 
+def _tilted(angle: float) -> str:
+    problem = (
+        f"the camera would have been tilted to all sides, by {angle:.0f}°, as if parts of the scene were turned over"
+    )
+    advice = "take photos that show both sides of what looks alike from two, or go on if you held it so"
+    return f"{problem}: {advice}"
+
+
 def _unlike(share: float) -> str:
     problem = "few points hold the photos together, and placed again with other random samples"
     return f"{problem} they move by {100 * share:.2g} % of a photo's size: take more photos in between"
@@ -99,6 +110,7 @@ CRITERIA = (
     Criterion("observations", 40.0, 15.0, _few_points),
     Criterion("parallax", 2.5, 1.8, _flat),
     Criterion("shift", 0.004, 0.0025, _turned),
+    Criterion("tilt", LARGEST_TILT, math.inf, _tilted),
     Criterion("disagreement", 0.02, 0.05, _unlike),
 )
 """What a model is judged by. A circular fisheye of 200° comes out at 120°. Anamorphic lenses squeeze pictures by two at
@@ -154,6 +166,7 @@ def measure(model: pycolmap.Reconstruction) -> Measures:
         observations=observations,
         parallax=_median_parallax(points, images),
         shift=_shift(points, images, cameras),
+        tilt=tilt(np.stack([image.cam_from_world().rotation.matrix() for image in images])),
     )
 
 

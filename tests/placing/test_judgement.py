@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from sadgs_ns.data.level import LARGEST_TILT
 from sadgs_ns.placing.judgement import CRITERIA, Judgement, Measures, judge, measure
 
 SIDE = 640
@@ -122,6 +123,28 @@ def test_each_measure_beyond_its_limits_is_a_reason(field: str, doubtful: float,
     assert not fault.is_sound
     with pytest.raises(AssertionError, match=reason):
         raise AssertionError(*fault.faults)
+
+
+def test_a_camera_that_is_tilted_to_all_sides_is_a_doubt_at_most():
+    doubt = judge(dataclasses.replace(SOUND, tilt=22.5))
+    (reason,) = doubt.doubts
+    assert reason.startswith("the camera would have been tilted to all sides, by 22°, as if parts of the scene were")
+    assert not doubt.faults
+    assert judge(dataclasses.replace(SOUND, tilt=7.5)).is_sound
+    assert not judge(dataclasses.replace(SOUND, tilt=35.2)).faults
+
+
+def test_a_model_whose_halves_are_turned_is_tilted():
+    rotations, centres = orbit(12)
+    level = measure(model_of(rotations, centres, points_ahead()))
+    assert level.tilt == pytest.approx(0, abs=1e-5)
+    over = cv2.Rodrigues(np.array([0.0, 0.0, np.pi / 2]))[0]
+    middle = np.array([0, 0, 5.0])
+    for i in range(0, 12, 2):
+        rotations[i] = rotations[i] @ over.T
+        centres[i] = over @ (centres[i] - middle) + middle
+    turned_half = measure(model_of(rotations, centres, points_ahead()))
+    assert turned_half.tilt > LARGEST_TILT
 
 
 def test_every_measure_has_a_criterion():

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sadgs_ns.data import colmap, ply
 from sadgs_ns.data.checks.findings import Finding, and_more, fault, note, warning
 from sadgs_ns.data.images import read_small
+from sadgs_ns.data.level import LARGEST_TILT, tilt
 from sadgs_ns.data.views import NO_COEFFICIENTS, Camera, View
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.outliers import CAMERA_SHARE, FEWEST_PLACES, POINT_SHARE, REACH, far_outliers, has_enough_places
@@ -40,7 +41,10 @@ def check_views(views: Sequence[View], training: int, source: Path) -> Generator
         if training > 1:
             few = f"{training} training views"
         findings.append(warning(f"{source} leaves {few}: so few fix no shape; take 20 or more."))
-    findings += check_rotations(views)
+    wrong_rotations = list(check_rotations(views))
+    findings += wrong_rotations
+    if not wrong_rotations:
+        findings += _check_tilt(views, source)
     findings += _check_centres(views, source)
     first = {view.camera: view.where_camera for view in reversed(views)}  # The first view with a camera names it.
     for camera, where in first.items():
@@ -70,6 +74,15 @@ def check_rotations(views: Sequence[View]) -> Iterator[Finding]:
         where = _first_of(views, mirrored)
         problem = f"{where} has a mirrored pose (determinant −1)"
         yield fault(f"{problem}: negate one column of its rotation, or compute the poses again.")
+
+
+def _check_tilt(views: Sequence[View], source: Path) -> Iterator[Finding]:
+    """Warn of cameras that no one holds so, as of parts that are joined wrongly."""
+    found = tilt(np.stack([view.rotation for view in views]))
+    if found > LARGEST_TILT:
+        problem = f"{source} has cameras that are tilted to all sides, by {found:.0f}° (root mean square)"
+        cause = "as where parts are joined wrongly because two sides of a thing look alike, or photos lie on their side"
+        yield warning(f"{problem}, {cause}: look at the poses in the viewer, and compute them again if parts overlap.")
 
 
 def _first_of(views: Sequence[View], marked: NDArray[np.bool_]) -> str:
