@@ -73,7 +73,7 @@ def read_settings(file: Path, folder: Path) -> dict[str, Any]:
         return {}
     try:
         return dict(json.loads(file.read_text("utf8")))
-    except ValueError as error:
+    except (TypeError, ValueError) as error:  # It is no JSON, or JSON of another kind than an object.
         raise InputError(f"{file} is damaged ({reason(error)}): delete {folder} and begin again.") from error
 
 

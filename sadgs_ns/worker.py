@@ -193,18 +193,24 @@ def main() -> None:
             os._exit(0)
 
     atexit.register(leave)  # As the first, it is called last, when no thread runs any more.
+    # The arguments come by standard input, of which the function itself sees nothing.
     channel = os.dup(0)
-    nowhere = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(nowhere, 0)
+    empty_input = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(empty_input, 0)
     try:
         with events.span("imports", function=sys.argv[1]):
             function = pkgutil.resolve_name(sys.argv[1])
-        with os.fdopen(channel, "rb", closefd=False) as given, suppress(EOFError):
-            command, arguments = pickle.load(given)
-            sys.argv = command or sys.argv
-            threading.Thread(target=_end_with_parent, args=(channel,), daemon=True).start()
-            events.report("result", value=function(*arguments))
-            returned = True
+        with os.fdopen(channel, "rb", closefd=False) as sent:
+            try:
+                command, arguments = pickle.load(sent)
+            except EOFError:  # The parent does not call `run` any more.
+                return
+        if command:
+            sys.argv = command
+        threading.Thread(target=_end_with_parent, args=(channel,), daemon=True).start()
+        result = function(*arguments)
+        events.report("result", value=result)
+        returned = True
     except KeyboardInterrupt:
         raise SystemExit(128 + signal.SIGINT) from None
     except Exception as error:

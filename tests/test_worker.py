@@ -72,6 +72,7 @@ def test_without_a_listener_events_go_nowhere(monkeypatch: pytest.MonkeyPatch, t
         ("import sys; print('sadgs-x: no photos.', file=sys.stderr); print(); sys.exit(2)", (2, "no photos")),
         ("raise SystemExit(3)", (3, "it printed nothing")),
         ("raise KeyError('a')", (1, "KeyError: 'a'")),
+        ("raise EOFError('the file is empty')", (1, "EOFError: the file is empty")),
         ("from sadgs_ns.errors import RunError; raise RunError('It failed.')", (1, "It failed")),
         (
             "print('╭─ Wrong ─╮\\n│ Wrong: --a │\\n│ or -b. │\\n│ ── │\\n│ Help │\\n╰────╯'); raise SystemExit(2)",

@@ -1426,10 +1426,11 @@ def test_a_folder_in_which_no_settings_could_be_noted_can_be_used(tmp_path: Path
 
 
 @pytest.mark.hard_case("a damaged `work/settings.json`", "one sentence names it: delete the folder and begin again")
-def test_damaged_settings_are_told_in_a_sentence(tmp_path: Path, capsys):
+@pytest.mark.parametrize("content", ['{"source": ', "[1, 2]", "null"])
+def test_damaged_settings_are_told_in_a_sentence(content: str, tmp_path: Path, capsys):
     photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
     (tmp_path / "out/work").mkdir(parents=True)
-    (tmp_path / "out" / "work/settings.json").write_text('{"source": ')
+    (tmp_path / "out" / "work/settings.json").write_text(content)
     status = main([str(photos), str(tmp_path / "out")])
     assert status == 2
     printed = capsys.readouterr().err
