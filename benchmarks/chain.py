@@ -33,6 +33,8 @@ LOADER = (
     "(script,) = {s for s in entry_points(group='console_scripts') if s.name == name}; sys.exit(script.load()())"
 )
 """A program that runs one of the package's commands, which need not be on the PATH."""
+_SCORER = "import sys; sys.argv = sys.argv[1:]; from benchmarks.chain_score import main; main()"
+"""A program that writes the score of a file."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +121,13 @@ def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
     splat = work / "splat.ply"
     call("export", "sadgs-export", str(run), "--output", str(splat), "--frame", "colmap")
     score = work / "score.json"
-    command = [sys.executable, "-m", "benchmarks.chain_score", str(scene), str(chain.photos), str(splat), str(score)]
-    subprocess.run([*command, "--max-size", str(chain.max_size)], env=environment_of(None), check=True)
+    words = ["chain_score", str(scene), str(chain.photos), str(splat), str(score), "--max-size", str(chain.max_size)]
+    run_program(_SCORER, words, work, environment_of(None))
     return {"seconds": seconds, "train_views": train_views, **json.loads(score.read_text())}
 
 
 def row_of(chain: Chain, work: Path, site: Path | None, log: Path) -> dict[str, Any]:
-    """Run a chain, and return its row, also that of one that fails; the output of that is added to a log."""
+    """Run a chain, and return its row; if a command fails, the chain's output is added to a log."""
     date = now()
     try:
         measured = run_chain(chain, work, site)
@@ -133,7 +135,8 @@ def row_of(chain: Chain, work: Path, site: Path | None, log: Path) -> dict[str, 
         output = (work / "log").read_text(errors="replace")
         with log.open("a") as file:
             file.write(f"=== {chain.key}\n{output}\n")
-        return failed(chain, date, f"{error.cmd[3:5]} ended with code {error.returncode}")
+        name = error.cmd[3]  # It follows Python, "-c" and the code.
+        return failed(chain, date, f"{name} ended with code {error.returncode}; see {log}.")
     return {**identity(chain, date), "status": "ok", "error": None, **measured}
 
 

@@ -72,8 +72,8 @@ def parser_options(measure: bool, train_options: Sequence[str]) -> list[str]:
 def divide(views: Sequence[str], measure: bool, earlier: Sequence[str] = (), held_out: Sequence[str] = ()) -> Lists:
     """Return the lists of views that are trained on and held out.
 
-    All are trained on unless they shall be measured. Then every eighth photo from the first is held out, a panorama
-    with all its views. Of photos that were added every eighth is, from their eighth.
+    All are trained on unless they shall be measured. Then every eighth photo is held out, the first one included. A
+    panorama is held out with all its views. Of photos that were added, the eighth, the sixteenth, … are held out.
 
     Args:
         views: The names of all images, in their order.
@@ -85,10 +85,11 @@ def divide(views: Sequence[str], measure: bool, earlier: Sequence[str] = (), hel
         return _lists(views, [])
     known = set(earlier)
     chosen = {view for view in held_out if view in known}
+    photos = {photo_of(view) for view in views}
     if chosen:
         added = [view for view in views if view not in known]
         chosen |= _every_eighth(added, INTERVAL - 1)
-    elif len({photo_of(view) for view in views}) < _FEWEST_PHOTOS:
+    elif len(photos) < _FEWEST_PHOTOS:
         chosen = set(views[::INTERVAL])
     else:
         chosen = _every_eighth(views, 0)
@@ -103,9 +104,13 @@ def _every_eighth(views: Sequence[str], first: int) -> set[str]:
 
 
 def divide_additions(described: dict[str, Any], additions: Sequence[Sequence[str]]) -> Lists:
-    """Return the division in a folder that an earlier version began.
+    """Return the division in a folder that an earlier version of sadgs began.
 
-    Views that are divided stay so, then each addition is divided by itself as nerfstudio would.
+    Views that are divided already stay as they are. Then each addition is divided by itself, as nerfstudio does it.
+
+    Args:
+        described: The content of the folder's transforms.json.
+        additions: The names of the folder's images, one list after each addition; a list may hold earlier ones.
     """
     from nerfstudio.data.utils.dataparsers_utils import get_train_eval_split_fraction
 
@@ -114,9 +119,9 @@ def divide_additions(described: dict[str, Any], additions: Sequence[Sequence[str
     for names in additions:
         known = {*trained, *held_out}
         new = [name for name in names if name not in known]
-        for_training, for_tests = get_train_eval_split_fraction(new, _TRAIN_FRACTION)
-        trained += [new[i] for i in for_training]
-        held_out += [new[i] for i in for_tests]
+        train_indices, test_indices = get_train_eval_split_fraction(new, _TRAIN_FRACTION)
+        trained += [new[index] for index in train_indices]
+        held_out += [new[index] for index in test_indices]
     return {"train_filenames": trained, "val_filenames": held_out, "test_filenames": held_out}
 
 

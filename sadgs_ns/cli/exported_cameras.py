@@ -67,9 +67,11 @@ def _check_images(pipeline: Mapping[str, Any], cameras: RunCameras) -> None:
     """Raise InputError if the capture's training images are not those of the checkpoint."""
     before = pipeline.get("_extra_state", {}).get("images")
     now = [path.name for path in cameras.images]
-    if before is not None and before != now:
-        problem = f"The capture has {len(now)} training images, {now[0]}, …, and the run had {len(before)}"
-        raise InputError(f"{problem}, {before[0]}, …: give the run's capture with --data.")
+    if before is None or before == now:
+        return
+    capture_has = f"The capture has {len(now)} training images, {now[0]}, …"
+    run_had = f"the run had {len(before)}, {before[0]}, …"
+    raise InputError(f"{capture_has}, and {run_had}: give the run's capture with --data.")
 
 
 def _frame(cameras: RunCameras, index: int) -> dict[str, Any]:

@@ -37,8 +37,8 @@ def format_of(path: Path) -> str:
 def write(path: Path, gaussians: Gaussians, context: Context = DEFAULTS) -> None:
     """Write Gaussians in the format that the file's name asks for; the file appears complete or not at all.
 
-    Only a PLY may hold none, and a page needs the context's start. Raise InputError if there is nothing to write, or
-    the format cannot hold it, and WriteError if the file cannot be written.
+    Only a PLY may hold no Gaussians, and an HTML page needs `context.start`. Raise InputError if there are no Gaussians
+    to write or if the format cannot hold them, and WriteError if the file cannot be written.
     """
     suffix = format_of(path)
     if not len(gaussians) and suffix != ".ply":

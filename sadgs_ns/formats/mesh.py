@@ -46,7 +46,10 @@ class DepthView:
 
 
 class Fusion:
-    """Voxels of an edge in world units, into which depth maps are fused, on the CPU; raises as `load_open3d`."""
+    """Voxels into which depth maps are fused, on the CPU; raises as `load_open3d`.
+
+    `voxel_size` is the length of a voxel's edge in world units.
+    """
 
     def __init__(self, voxel_size: float) -> None:
         open3d = load_open3d()
@@ -60,9 +63,9 @@ class Fusion:
         self._grid = open3d.t.geometry.VoxelBlockGrid(names, types, shapes, voxel_size, _RESOLUTION, _BLOCKS)
 
     def _blocks(self, view: DepthView) -> tuple[Any, dict[str, Any]] | None:
-        """Return the blocks near the surfaces in a view, int32 [B, 3], and the view as Open3D takes it.
+        """Return the blocks near the surfaces in a view, int32 [B, 3], and the view as arguments of Open3D.
 
-        Open3D looks at every fourth pixel of every fourth row; the result is None if these show nothing near.
+        None if there are no such blocks. Open3D finds them by every fourth pixel of every fourth row.
         """
         tensor = self._core.Tensor
         camera = {
@@ -74,23 +77,24 @@ class Fusion:
         }
         depth = self._image(tensor(view.depth[..., None]))
         try:
-            return self._grid.compute_unique_block_coordinates(depth, **camera), {"depth": depth, **camera}
+            blocks = self._grid.compute_unique_block_coordinates(depth, **camera)
         except RuntimeError as error:
-            if "No block is touched" not in str(error):
-                raise
-            return None
+            if "No block is touched" in str(error):
+                return None
+            raise
+        return blocks, {"depth": depth, **camera}
 
     def has_room_for(self, views: Sequence[DepthView]) -> bool:
         """Return whether these views need at most a quarter of `MOST_VOXELS`; the rest is for other views."""
-        of_views = []
+        blocks_of_views = []
         for view in views:
             found = self._blocks(view)
             if found is not None:
                 blocks, _ = found
-                of_views.append(blocks.numpy())
-        if not of_views:
+                blocks_of_views.append(blocks.numpy())
+        if not blocks_of_views:
             return True
-        distinct = np.unique(np.concatenate(of_views), axis=0)
+        distinct = np.unique(np.concatenate(blocks_of_views), axis=0)
         return 4 * len(distinct) * _RESOLUTION**3 <= MOST_VOXELS
 
     def add(self, view: DepthView) -> None:
@@ -100,12 +104,13 @@ class Fusion:
         if found is None:
             return
         blocks, camera = found
-        voxels = self._grid.hashmap()
-        known = 0
-        if voxels.size():
-            _, is_known = voxels.find(blocks)
-            known = is_known.numpy().sum()
-        if (voxels.size() + len(blocks) - known) * _RESOLUTION**3 > MOST_VOXELS:
+        stored_blocks = self._grid.hashmap()
+        num_known = 0
+        if stored_blocks.size():
+            _, is_known = stored_blocks.find(blocks)
+            num_known = is_known.numpy().sum()
+        num_blocks = stored_blocks.size() + len(blocks) - num_known
+        if num_blocks * _RESOLUTION**3 > MOST_VOXELS:
             problem = f"A mesh of voxels of {self.voxel_size:.3g} does not fit in memory"
             raise InputError(f"{problem}: give a larger one, such as --voxel-size {2 * self.voxel_size:.2g}.")
         color = self._image(self._core.Tensor(view.color))

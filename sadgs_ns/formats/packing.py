@@ -33,8 +33,9 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the index of each unit quaternion's largest component, and the others, signed so that it is positive.
+    """Return the index of each unit quaternion's largest component, and its three other components.
 
+    Where the largest component is negative, the others have the opposite sign, as q and −q are the same rotation.
     [N, 4] → [N], [N, 3] in ±√½
     """
     largest = np.abs(quats).argmax(axis=1)
@@ -48,23 +49,23 @@ def smallest_three(quats: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArr
 def codebook(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return ascending levels that quantise one value or more with little mean square error. [...] → [256]
 
-    They begin as dense as the cube root of the values, which is best for many levels, and a fifth of them evenly, so
-    that no rare value is far from a level. Lloyd's algorithm improves them.
+    The first levels follow a density. Four fifths of it are the cube root of the values' density, which is best for
+    many levels. One fifth is even, so that no rare value is far from a level. Lloyd's algorithm improves these levels.
     """
     counts, edges = np.histogram(values, _BINS)
     density = np.cbrt(counts)
-    mixture = density + 0.25 * density.mean()
-    mass = np.concatenate([[0.0], np.cumsum(mixture)])
+    even = 0.25 * density.mean()
+    cumulative = np.concatenate([[0.0], np.cumsum(density + even)])
     step = math.ceil(values.size / _SAMPLE)
     sample = values.flatten()[::step]
-    places = (np.arange(_LEVELS) + 0.5) / _LEVELS * mass[-1]
-    levels = np.interp(places, mass, edges)
+    quantiles = (np.arange(_LEVELS) + 0.5) / _LEVELS
+    levels = np.interp(quantiles * cumulative[-1], cumulative, edges)
     for _ in range(_ROUNDS):
         labels = nearest_level(sample, levels)
-        numbers = np.bincount(labels, minlength=_LEVELS)
-        sums = np.bincount(labels, sample, _LEVELS)
-        means = sums / np.maximum(numbers, 1)
-        levels = np.where(numbers > 0, means, levels)
+        sizes = np.bincount(labels, minlength=_LEVELS)
+        sums = np.bincount(labels, weights=sample, minlength=_LEVELS)
+        means = sums / np.maximum(sizes, 1)
+        levels = np.where(sizes > 0, means, levels)
     return levels.astype(np.float32)
 
 

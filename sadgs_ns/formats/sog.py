@@ -95,10 +95,11 @@ def _image(pixels: NDArray[np.uint8], width: int) -> Image.Image:
 
 
 def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return at most `_PALETTE` vectors [P, D] that stand for all [N, D], and the index of the one for each [N].
+    """Return a palette [P, D] of vectors [N, D], and the index of each vector's entry in the palette [N].
 
-    k-means finds coarse clusters of a sample, and then fine ones in each, by its share of the vectors. That takes the
-    square root of the distances that one k-means of all would compute.
+    P is at most `_PALETTE`. k-means finds coarse clusters of a sample, and then fine ones in each coarse cluster, as
+    many as its share of the vectors asks for. A vector is so compared with about 2 √P centres in a round; one k-means
+    of all vectors would compare it with P.
     """
     number = min(_PALETTE, len(vectors) // 2 + 1)
     generator = np.random.default_rng(0)
@@ -108,16 +109,18 @@ def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
         sample = vectors[chosen]
     coarse = _k_means(sample, math.isqrt(number), generator)
     parts = np.array_split(vectors, len(vectors) // _SAMPLE + 1)
-    belongs = np.concatenate([_nearest(part, coarse) for part in parts])
+    coarse_labels = np.concatenate([_nearest(part, coarse) for part in parts])
     centers = []
     labels = np.empty(len(vectors), np.int64)
     used = 0
     for cluster in range(len(coarse)):
-        (members,) = (belongs == cluster).nonzero()
+        (members,) = (coarse_labels == cluster).nonzero()
         if not len(members):
             continue
-        share = max(number * len(members) // len(vectors) - 1, 1)  # Rounding up must not exceed the palette.
-        fine = _k_means(vectors[members], share, generator)
+        share = number * len(members) // len(vectors)
+        # One less, because shares below 1 are rounded up: all together must not exceed the palette.
+        num_fine = max(share - 1, 1)
+        fine = _k_means(vectors[members], num_fine, generator)
         labels[members] = used + _nearest(vectors[members], fine)
         centers.append(fine)
         used += len(fine)
@@ -125,7 +128,7 @@ def palette(vectors: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[
 
 
 def _k_means(vectors: NDArray[np.float32], number: int, generator: np.random.Generator) -> NDArray[np.float32]:
-    """Return centres of at least as many vectors. [N, D] → [number, D]"""
+    """Return the centres of `number` clusters of vectors, which are at least as many. [N, D] → [number, D]"""
     from scipy.cluster.vq import kmeans2  # It takes a third of a second to import.
 
     chosen = generator.choice(len(vectors), number, replace=False)

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import pycolmap
 
-_SIMPLE = "SIMPLE_RADIAL"
-_WHOLE = "OPENCV"
+_SIMPLE = "SIMPLE_RADIAL"  # COLMAP's model with one focal length and one coefficient of distortion
+_WHOLE = "OPENCV"  # COLMAP's model with two focal lengths and four coefficients
 
 
 @contextlib.contextmanager
 def few_parameters(database: Path, fixed_cameras: Collection[int]) -> Iterator[None]:
     """Give the cameras of COLMAP's database one focal length and one coefficient of distortion within this context.
 
-    `fixed_cameras` stay as they are. Afterwards all others have the parameters of OPENCV again, those of a run that was
-    killed within this context, too.
+    `fixed_cameras` stay as they are. Afterwards all other cameras have the parameters of OPENCV again. This includes
+    cameras that still have few parameters because an earlier run was killed within this context.
     """
     _change_cameras(database, _SIMPLE, fixed_cameras)
     try:
@@ -47,7 +47,7 @@ def _change_cameras(database: Path, name: str, fixed_cameras: Collection[int]) -
 
 
 def free_all_parameters(model: pycolmap.Reconstruction) -> None:
-    """Give the cameras of a model that have few parameters those of OPENCV, with equal projections."""
+    """Give cameras with few parameters those of OPENCV; each projects points to the same pixels as before."""
     for camera in model.cameras.values():
         if camera.model_name == _SIMPLE:
             focal, x, y, distortion = camera.params

@@ -184,18 +184,22 @@ def _stretch(camera: pycolmap.Camera) -> float:
 
 
 def _median_parallax(points: Sequence[pycolmap.Point3D], images: Sequence[pycolmap.Image]) -> float:
-    """Return the median over points of the largest angle between two rays to each in degrees, NaN without tracks."""
+    """Return the median parallax of points in degrees, NaN without tracks.
+
+    The parallax of a point is the largest angle between the rays of two cameras that see it.
+    """
     centres = {image.image_id: image.projection_center() for image in images}
-    angles = []
+    parallaxes = []
     for point in points:
         seen_from = [centres[element.image_id] for element in point.track.elements]
         if len(seen_from) > 1:
             rays = np.stack(seen_from) - point.xyz
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            angles.append(math.degrees(math.acos(np.clip((rays @ rays.T).min(), -1.0, 1.0))))
-    if not angles:
+            smallest_cosine = np.clip((rays @ rays.T).min(), -1.0, 1.0)
+            parallaxes.append(math.degrees(math.acos(smallest_cosine)))
+    if not parallaxes:
         return math.nan
-    return float(np.median(angles))
+    return float(np.median(parallaxes))
 
 
 def _shift(

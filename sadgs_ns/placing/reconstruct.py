@@ -62,6 +62,11 @@ the two focal lengths: those of lenses and of resized photos differ less, those 
 _SEED_STEP = 1000  # Seeds of one placing lie this far apart, so that those of benchmarks, 0, 1, 2, …, share none
 _DISAGREEMENT = "disagreement.txt"  # File in a model's folder that holds `Measures.disagreement`
 FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
+_COUNT_BYTES = 8  # A file of COLMAP's binary format begins with the number of its images or points.
+_IMAGE_BYTES = 73  # An image in images.bin, without the letters of its name and without its keypoints
+_KEYPOINT_BYTES = 24  # A keypoint in images.bin
+_POINT_BYTES = 51  # A point in points3D.bin, without its track
+_TRACK_ELEMENT_BYTES = 8  # An observation of a point in points3D.bin
 
 
 def make_model(
@@ -453,17 +458,21 @@ def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
 
 
 def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Raise OSError if the files of a written model are smaller than it; COLMAP does not say that a disk is full.
+    """Raise OSError if the files of a model are shorter than its content; COLMAP does not say that a disk is full.
 
-    COLMAP must not read them: it takes any bytes of a file that is cut off for a length, and asks for as much memory.
+    COLMAP must not read the files to check them. In a file that is cut off it takes wrong bytes for a length, and asks
+    for that much memory.
     """
-    images = (image for image in model.images.values() if image.has_pose)
-    expected = {  # COLMAP's binary formats
-        "images.bin": 8 + sum(73 + len(image.name.encode()) + 24 * image.num_points2D() for image in images),
-        "points3D.bin": 8 + sum(51 + 8 * point.track.length() for point in model.points3D.values()),
-    }
-    if any((folder / name).stat().st_size < size for name, size in expected.items()):
-        raise OSError(f"{folder} was not written completely: the disk is full")
+    images_size = _COUNT_BYTES
+    for image in model.images.values():
+        if image.has_pose:
+            images_size += _IMAGE_BYTES + len(image.name.encode()) + _KEYPOINT_BYTES * image.num_points2D()
+    points_size = _COUNT_BYTES
+    for point in model.points3D.values():
+        points_size += _POINT_BYTES + _TRACK_ELEMENT_BYTES * point.track.length()
+    for name, size in (("images.bin", images_size), ("points3D.bin", points_size)):
+        if (folder / name).stat().st_size < size:
+            raise OSError(f"{folder} was not written completely: the disk is full")
 
 
 def summarize(

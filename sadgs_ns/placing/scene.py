@@ -151,7 +151,7 @@ class Scene:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Lock the work folder, and leave nothing half-written there; a new scene's settings are noted first."""
+        """Write a new scene's settings, then lock the work folder; nothing half-written is left there at the end."""
         if self.begun is None:
             self.settings.write(self._settings_file)
         with locked(self.work, f"another sadgs-process works on {self.options.out}; wait for it, or stop it."):
@@ -163,7 +163,7 @@ class Scene:
                 (self.work / "pairs.txt").unlink(missing_ok=True)
 
     def finish(self, summary: Summary) -> None:
-        """Note that the scene is finished, and remove the files that are not needed to add photos to it."""
+        """Write that the scene is finished, and remove the files that are not needed to add photos to it."""
         self.settings.max_size = self.options.max_size
         self.settings.finished = dataclasses.asdict(summary)
         self.settings.model = self.model.name

@@ -122,19 +122,19 @@ class Undistortion:
 def warp_of(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> Warp | None:
     """Return the warp from a photo of `camera` to an image of COLMAP's undistorted camera.
 
-    None if a side is longer than `MOST_SIDE`.
+    It undistorts a photo at its full size, and then reduces the image to the size that `options` ask for. None if a
+    side is longer than `MOST_SIDE`.
     """
     final = pycolmap.undistort_camera(options, camera)
-    whole_size = pycolmap.UndistortCameraOptions()
-    whole = pycolmap.undistort_camera(whole_size, camera)
-    if max(camera.width, camera.height, whole.width, whole.height) > MOST_SIDE:
+    full_size = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    if max(camera.width, camera.height, full_size.width, full_size.height) > MOST_SIDE:
         return None
-    map_x, map_y = maps_of(camera, whole)
+    map_x, map_y = maps_of(camera, full_size)
     size = (final.width, final.height)
 
     def warp(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
         image = cv2.remap(photo, map_x, map_y, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT_101)
-        if (whole.width, whole.height) != size:
+        if (full_size.width, full_size.height) != size:
             # Pillow's filters grow with the reduction; OpenCV's do not.
             image = Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)
         return np.asarray(image, np.uint8)
@@ -151,7 +151,8 @@ def maps_of(camera: pycolmap.Camera, undistorted: pycolmap.Camera) -> tuple[NDAr
     y = np.arange(undistorted.height) + 0.5
     pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     rays = np.asarray(undistorted.cam_from_img(pixels))[:, :2]
-    in_photo = np.asarray(camera.img_from_cam(np.c_[rays, np.ones(len(rays))])) - 0.5
+    points = np.c_[rays, np.ones(len(rays))]  # At depth 1 before the camera. [H · W, 3]
+    in_photo = np.asarray(camera.img_from_cam(points)) - 0.5
     maps = in_photo.astype(np.float32).reshape(undistorted.height, undistorted.width, 2)
     return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
 
@@ -184,7 +185,8 @@ def write_as_colmap(
     bitmap = pycolmap.Bitmap.read(photo, as_rgb=True)
     if bitmap is None:
         raise _missing(photo)
-    pycolmap.undistort_image(options, bitmap, camera)[0].write(target)
+    undistorted, _ = pycolmap.undistort_image(options, bitmap, camera)
+    undistorted.write(target)
 
 
 def write_grey(
@@ -194,24 +196,31 @@ def write_grey(
     target.parent.mkdir(parents=True, exist_ok=True)
     grey = pycolmap.Bitmap.read(stored, as_rgb=False)
     assert grey is not None  # `write_alpha` or `write_masks` wrote it.
-    grey = pycolmap.undistort_image(options, grey, camera)[0]
+    undistorted, _ = pycolmap.undistort_image(options, grey, camera)
     if is_mask:
-        grey = pycolmap.Bitmap.from_array(np.uint8(255 * (grey.to_array() > 127)))
-    grey.write(target)
+        is_white = undistorted.to_array() > 127
+        undistorted = pycolmap.Bitmap.from_array(np.uint8(255 * is_white))
+    undistorted.write(target)
 
 
 def without_distortion(made: pycolmap.Reconstruction, cameras: dict[int, pycolmap.Camera]) -> pycolmap.Reconstruction:
-    """Return a copy of a model with other cameras, in whose images its keypoints lie then."""
+    """Return a copy of a model that has undistorted cameras, and its keypoints where they lie in undistorted images.
+
+    Args:
+        made: The model of the photos; it stays as it is.
+        cameras: The undistorted cameras, by the numbers of those of the photos.
+    """
     model = pycolmap.Reconstruction(made)
     for image in model.images.values():
-        points = image.points2D
-        if len(points) == 0:
+        keypoints = image.points2D
+        if len(keypoints) == 0:
             continue
-        distorted = np.array([point.xy for point in points])
-        rays = np.asarray(made.cameras[image.camera_id].cam_from_img(distorted))[:, :2]
-        undistorted = np.asarray(cameras[image.camera_id].img_from_cam(np.c_[rays, np.ones(len(rays))]))
-        for point, xy in zip(points, undistorted, strict=True):
-            point.xy = xy
+        in_photo = np.array([keypoint.xy for keypoint in keypoints])  # [K, 2]
+        rays = np.asarray(made.cameras[image.camera_id].cam_from_img(in_photo))[:, :2]
+        points = np.c_[rays, np.ones(len(rays))]  # At depth 1 before the camera. [K, 3]
+        in_image = np.asarray(cameras[image.camera_id].img_from_cam(points))  # [K, 2]
+        for keypoint, xy in zip(keypoints, in_image, strict=True):
+            keypoint.xy = xy
     for camera_id, new in cameras.items():
         camera = model.cameras[camera_id]
         camera.model = new.model

@@ -135,9 +135,10 @@ class SadgsPipeline(VanillaPipeline):
             warn("--mask-color does nothing, because the capture has no masks: leave it out, or name them.")
 
     def point_observations(self, split: Literal["train", "eval"]) -> PointObservations | None:
-        """Return what reads the colours of SfM points in the photos of a split; None if there are no points.
+        """Return a reader of the SfM points' colours in the photos of a split; None if there are no points.
 
-        It loads the images' cameras, so call it after `near_plane_of_scene`. Raises as `PointObservations`.
+        The reader uses the dataset's cameras, which change when images are undistorted: give it images that are loaded.
+        Raises as `PointObservations`.
         """
         if self.model.seed_points is None:
             return None

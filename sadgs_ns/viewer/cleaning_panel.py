@@ -114,16 +114,16 @@ class CleaningPanel(torch.nn.Module):
         self._show_text("\n\n".join(sentences))
 
     def _measure_visibility(self) -> None:
-        """Measure what the training views see of the Gaussians, unless that was done for these Gaussians before."""
+        """Measure how the training views see the Gaussians, if training has changed them since the last time."""
         model = self._run.model
-        now = (model.num_points, model.step)  # Training changes these, and outdates the measurement.
-        if self._measured_at == now:
+        state_of_training = (model.num_points, model.step)
+        if self._measured_at == state_of_training:
             return
         self._show_text("Looking from all training views …")
         params = dict(model.gauss_params.items())
         cameras = [(view.viewmats[0], view.Ks[0], view.width, view.height) for view in self._run.view_cameras()]
         self._visibility = measure_visibility(params, cameras, model.drawing)
-        self._measured_at = now
+        self._measured_at = state_of_training
 
     def _show_text(self, text: str) -> None:
         self._text = text

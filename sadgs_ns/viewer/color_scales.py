@@ -123,14 +123,14 @@ class Panel:
 def draw(path: Path, panels: Sequence[Panel], columns: int) -> None:
     """Write pictures with titles and colour bars, in rows of `columns`, as a PNG; raise WriteError if it fails.
 
-    There must be a picture, and the first one's shape is that of the places for all.
+    There must be at least one picture. The room for each has the shape of the first one.
     """
     from matplotlib.figure import Figure
 
     rows = math.ceil(len(panels) / columns)
     figure = Figure(figsize=_figure_size(panels, rows, columns), layout="compressed")
-    places = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, panel in zip(places, panels, strict=False):  # The last row may have more places than pictures.
+    all_axes = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, panel in zip(all_axes, panels, strict=False):  # The last row may have more axes than pictures.
         axes.imshow(panel.picture, interpolation="nearest")
         axes.set_title(panel.title, fontsize=10)
         axes.set_axis_off()

@@ -215,3 +215,27 @@ def test_a_chain_that_ends_without_a_row_is_a_failed_one_and_the_others_go_on(
     started.clear()
     command()
     assert started == [("desk", "1")], "what is done is not done again"
+
+
+def test_a_score_that_fails_has_a_row_with_its_name_and_its_output_in_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    photos = tmp_path / "desk"
+    photos.mkdir()
+    (photos / "0.jpg").touch()
+    work = tmp_path / "work"
+    (work / "scene").mkdir(parents=True)
+    write_json(work / "scene/transforms.json", {"frames": [{"file_path": "images/0.jpg"}]})
+
+    def run_program(code: str, *arguments: Any) -> None:
+        if code != chain.LOADER:  # The package's commands leave no splat here, which the score needs.
+            side_by_side.run_program(code, *arguments)
+
+    monkeypatch.setattr(chain, "run_program", run_program)
+    log = tmp_path / "rows.log"
+    failed = chain.row_of(chain.Chain("desk", photos, 0, "new", 64, 1.0), work, None, log)
+    assert failed["status"] == "failed"
+    assert failed["error"] == f"chain_score ended with code 1; see {log}."
+    output = log.read_text()
+    assert output.startswith("=== desk/new/0\n")
+    assert "splat.ply" in output

@@ -22,15 +22,16 @@ _PATIENCE = 2.0  # Seconds after which the user is told what the run is waiting 
 
 
 def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> KernelChoice:
-    """Return what decides which kernels a run needs."""
+    """Return the properties of a run by which its kernels are chosen."""
     model = pipeline.model
-    sizes = pipeline.datamanager.train_dataset.cameras
-    alike: dict[Any, list[tuple[int, ...]]] = {}  # as `AdamUpdate` has them
+    cameras = pipeline.datamanager.train_dataset.cameras
+    launches: dict[Any, list[tuple[int, ...]]] = {}  # Shapes of the parameters that `AdamUpdate` updates together
     for name, optimizer in optimizers.items():
         value = model.trained_params.get(name)
         if value is not None and value.numel() and not isinstance(optimizer, RowAdam):
-            key = name in model.gauss_params, optimizer.defaults["betas"], optimizer.defaults["eps"]
-            alike.setdefault(key, []).append(tuple(value.shape[1:]))
+            is_of_gaussians = name in model.gauss_params
+            key = (is_of_gaussians, optimizer.defaults["betas"], optimizer.defaults["eps"])
+            launches.setdefault(key, []).append(tuple(value.shape[1:]))
     return KernelChoice(
         device=pipeline.device,
         views=model.plan.views_per_iteration,
@@ -39,16 +40,16 @@ def choose_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim
         has_color_matrices=model.has_view_colors,
         moves_cameras=model.poses is not None,
         single_process=model.world.is_single,
-        size=(int(sizes.width.max()), int(sizes.height.max())),
+        size=(int(cameras.width.max()), int(cameras.height.max())),
         # The run's own near plane may lie behind these Gaussians, which would launch no compositing.
         drawing=replace(model.drawing, near_plane=NEAR_PLANE, backend=model.backend),
-        updates=tuple(map(tuple, alike.values())),
+        updates=tuple(map(tuple, launches.values())),
         structure_tensor=pipeline.structure_cache.of_images,
     )
 
 
 def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
-    """Launch the kernels of training once, on a few Gaussians, after those of `compile_ahead` are compiled.
+    """Launch the kernels of training once, on a few Gaussians, when `compile_ahead` is done.
 
     Triton keeps kernels on the disk, so only a machine's first run takes seconds here. The run's state, random numbers
     included, does not change. If kernels fail, a warning names them, and the run goes on: it may never need them.
@@ -57,16 +58,17 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         return
     failures: dict[str, Exception] = {}
 
-    def launch(some: Mapping[str, Callable[[], None]]) -> bool:
-        for name, stage in some.items():
+    def launch(named_stages: Mapping[str, Callable[[], None]]) -> bool:
+        """Launch each stage, keep its error, and return whether there was none."""
+        for name, stage in named_stages.items():
             try:
                 stage()
             except Exception as error:
                 failures[name] = error
-        return not some.keys() & failures.keys()
+        return failures.keys().isdisjoint(named_stages)
 
-    patience = threading.Timer(_PATIENCE, note, ["Compiling kernels for this GPU, once …"])
-    patience.start()
+    notice = threading.Timer(_PATIENCE, note, ["Compiling kernels for this GPU, once …"])
+    notice.start()
     try:
         compile_ahead.wait()
         stages = Stages(choose_kernels(pipeline, optimizers))
@@ -74,7 +76,7 @@ def compile_kernels(pipeline: SadgsPipeline, optimizers: Mapping[str, torch.opti
         if launch({"rasterization": stages.project}):
             launch(stages.after_projection())
     finally:
-        patience.cancel()
+        notice.cancel()
     if failures:
         cause = reason(next(iter(failures.values())))
         problem = f"The kernels of {', '.join(failures)} could not be compiled and tried before training ({cause})"

@@ -30,7 +30,7 @@ _LONGEST = 60.0  # Seconds without progress after which the run no longer waits
 _HERE = Path(__file__).parent
 _CARDS = Path("/proc/driver/nvidia/gpus")
 _process: subprocess.Popen[bytes] | None = None
-_found: list[tuple[Any, Any, dict[str, Any]]] = []  # source, target and options of each kernel, for forked processes
+_found: list[tuple[Any, Any, dict[str, Any]]] = []  # Source, target and options of each kernel, for forked processes
 
 
 def begin() -> None:
@@ -91,7 +91,7 @@ def _marker() -> Path | None:
 
 
 def find_kernels() -> None:
-    """Note what the stages of a step would launch; launches nothing from then on in this process."""
+    """Collect in `_found` the kernels of a step's stages; from then on this process launches none."""
     import torch
     from triton import knobs
     from triton.compiler import ASTSource
@@ -100,9 +100,10 @@ def find_kernels() -> None:
     from sadgs_ns.kernels import tiles, trial, triton_switched
     from sadgs_ns.training.kernels_ahead.probes import KernelChoice, Stages
 
-    known = set()
+    known = set()  # Names of kernels, each with the key of its signature and options
 
-    def note(*, key: str, fn: Any, compile: Any, **_: Any) -> bool:
+    def collect(*, key: str, fn: Any, compile: Any, **_: Any) -> bool:
+        """Add a kernel to `_found` if it is new there; Triton calls this before it would compile the kernel."""
         if (fn.name, key) not in known:
             known.add((fn.name, key))
             source = ASTSource(fn.jit_function, compile["signature"], compile["constants"], compile["configs"][0])
@@ -112,11 +113,11 @@ def find_kernels() -> None:
                 if isinstance(value, list):  # JSON has no tuples.
                     options[name] = tuple(value)
             _found.append((source, target, options))
-        return True  # Triton neither compiles nor launches it.
+        return True  # Triton then neither compiles nor launches it.
 
-    # Nothing counts pairs.
+    # The kernel that counts pairs is not launched either.
     tiles.PairCounts.wait = lambda self: [1]
-    knobs.runtime.jit_cache_hook = note
+    knobs.runtime.jit_cache_hook = collect
     trial.hash_kernels()
     torch.set_num_threads(1)
     stages = Stages(KernelChoice(torch.device("cpu")))
@@ -127,7 +128,7 @@ def find_kernels() -> None:
 
 
 def compile_kernel(index: int) -> None:
-    """Compile a kernel that `find_kernels` noted, and what launches it, into Triton's cache."""
+    """Compile a kernel that `find_kernels` found, and the code that launches it, into Triton's cache."""
     from triton import compile
     from triton.runtime import driver
 
@@ -138,7 +139,7 @@ def compile_kernel(index: int) -> None:
 
 
 def main() -> None:
-    """Compile all kernels, and tell after each how many are done, and of how many; runs in the process of `begin`."""
+    """Compile all kernels, and print after each how many of all are done; runs in the process of `begin`."""
     os.nice(5)  # The run must go on meanwhile.
     find_kernels()
     processes = min(len(_found), num_cores() - 1)

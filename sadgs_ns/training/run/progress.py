@@ -181,7 +181,7 @@ class ProgressTable(LocalWriter):
         return shown_pace, duration(left)
 
     def _show(self, row: str) -> None:
-        """Print a row, or put it below the others in place."""
+        """Print a row, or add it to the rows that a terminal shows in place."""
         header = [_line(list(COLUMNS)), "-" * sum(COLUMNS.values())]
         if self._live is None:
             lines = [row]

@@ -74,21 +74,26 @@ class Resumption:
             return RunPlan.of(state["plan"])
 
     def load_gaussians(self, pipeline: SadgsPipeline, world: World) -> None:
-        """Load the pipeline with this process's part of the Gaussians; call before optimizers are made."""
+        """Load the pipeline with this process's part of the Gaussians; call before optimizers are made.
+
+        Raises InputError if the checkpoint is damaged, of another capture, or has parameters that the run lacks.
+        """
         with self._errors_name_file():
             if not world.is_single:
-                part = world.take_even_part(len(self.state["pipeline"]["_model.gauss_params.means"]))
+                num_gaussians = len(self.state["pipeline"]["_model.gauss_params.means"])
+                part = world.take_even_part(num_gaussians)
                 self.state = checkpoints.map_rows(self.state, lambda rows: rows[part].clone())
             pipeline.load_pipeline(self.state["pipeline"], self.state["step"])
             extra = self.state["pipeline"]["_extra_state"]
             check_same_capture(pipeline, extra["images"], extra["camera_positions"])
-            if pipeline.model.poses is not None:  # The moments of earlier versions are in other units.
+            if pipeline.model.poses is not None:
+                # Earlier versions kept Adam's moments of the poses in other units, so these start anew.
                 self.state["optimizers"].pop("camera_opt", None)
                 self.state.get("schedulers", {}).pop("camera_opt", None)
-            others = sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys())
-            if others:
+            missing = sorted(self.state["optimizers"].keys() - pipeline.get_param_groups().keys())
+            if missing:
                 raise InputError(
-                    f"It optimized {' and '.join(others)}, too: set pipeline.model.color-model and "
+                    f"It optimized {' and '.join(missing)}, too: set pipeline.model.color-model and "
                     "pipeline.model.poses as they were, and train on one device."
                 )
 

@@ -206,14 +206,18 @@ class SadgsTrainer(Trainer):
         return f"what the last checkpoint holds goes on with --load-dir {self.checkpoint_dir}"
 
     def train_iteration(self, step: int) -> tuple[Tensor, dict[str, Tensor], dict[str, Any]]:
-        """Train on the views of a step, which no signal stops until `_update_viewer_state`; return loss and metrics."""
+        """Train on the views of a step, and return the loss, the losses by name, and metrics.
+
+        A signal stops the run only after the step, in `_update_viewer_state`.
+        """
         self._stepping = True
-        # Several processes agree in the step what to do after it.
+        # In the step, several processes agree whether to save or stop after it.
         self.world.flags_in = 0
         self.world.flags_out = self._own_requests().encode()
         model = self.pipeline.model
         if self.graphed is not None and model.tile_forecast is not None:
-            model.tile_forecast.round_to_powers = self.graphed.prepare(model.plan.views_per_iteration)
+            can_replay = self.graphed.prepare(model.plan.views_per_iteration)
+            model.tile_forecast.round_to_powers = can_replay  # Each capacity needs a graph of its own.
         groups = self.pipeline.next_views(step)
         result = self._train_on(groups)
         self.pipeline.record_step(step, groups, result)
@@ -307,7 +311,7 @@ class SadgsTrainer(Trainer):
         raise SystemExit(128 + interrupted.number)
 
     def _write_config_to_resume(self, total: int) -> Path:
-        """Name the last checkpoint in `config.yml`, from which --load-config takes all options; return its path."""
+        """Write a `config.yml` with which --load-config resumes from the last checkpoint; return its path."""
         config = copy.copy(self.config)
         config.max_num_iterations = total
         config.load_dir = self.checkpoint_dir

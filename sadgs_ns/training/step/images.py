@@ -173,7 +173,8 @@ def _undistort_cameras(cameras: Cameras) -> list[Undistortion | None]:
 class ImagePrefetcher:
     """Copies images from the host to the device ahead of the step that needs them, on its own stream.
 
-    Threads decode `LazyImages` and pin them; those that are `decoded` need none. Without CUDA only decoding runs ahead.
+    Threads decode `LazyImages` and pin them. If all images are decoded, and with CUDA pinned, no threads are needed.
+    Without CUDA only decoding runs ahead.
     """
 
     def __init__(self, images: Sequence[Mapping[str, Any]], device: torch.device, threads: int) -> None:
@@ -181,26 +182,36 @@ class ImagePrefetcher:
         self.device = device
         self.threads = threads
         on_cuda = device.type == "cuda"
-        self.decoded = isinstance(images, list) and all(not on_cuda or data["image"].is_pinned() for data in images)
+        self.decoded = isinstance(images, list)
+        if self.decoded and on_cuda:
+            self.decoded = all(data["image"].is_pinned() for data in images)
         self._stream = None
         if on_cuda:
             self._stream = torch.cuda.Stream(device)
         self._pool: ThreadPoolExecutor | None = None
         self._loading: dict[int, Future[dict[str, Any]]] = {}
-        self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}
+        self._sent: dict[int, tuple[dict[str, Any], torch.cuda.Event | None]] = {}  # What `_copy` returned, by view
 
     def take(self, indices: Sequence[int]) -> dict[int, dict[str, Any]]:
-        """Return data of a step's views by index, on the device, for this stream; only decoding is waited for."""
+        """Return the data of a step's views by index, on the device.
+
+        The host waits for images to be decoded only. The present stream waits for their copies.
+        """
         self._load(indices)
         data_by_view = {}
         for index in indices:
-            data_by_view[index], copied = self._sent.pop(index, None) or self._copy(index)
-            if copied is not None:
-                stream = torch.cuda.current_stream(self.device)
-                stream.wait_event(copied)
-                for value in data_by_view[index].values():
-                    if isinstance(value, Tensor) and value.is_cuda:
-                        value.record_stream(stream)  # Its memory belongs to the copying stream.
+            sent = self._sent.pop(index, None)
+            if sent is None:
+                sent = self._copy(index)
+            data, copied = sent
+            data_by_view[index] = data
+            if copied is None:
+                continue
+            stream = torch.cuda.current_stream(self.device)
+            stream.wait_event(copied)
+            for value in data.values():
+                if isinstance(value, Tensor) and value.is_cuda:
+                    value.record_stream(stream)  # Its memory belongs to the copying stream.
         return data_by_view
 
     def prefetch(self, upcoming: Sequence[int], following: Sequence[int]) -> None:
@@ -231,10 +242,10 @@ class ImagePrefetcher:
             if index in self._loading or index in self._sent:
                 continue
             if self._pool is None:
-                initializer: Any = ()
-                if self._stream is not None:
-                    initializer = (torch.cuda.set_device, (self.device,))
-                self._pool = ThreadPoolExecutor(self.threads, "images", *initializer)
+                if self._stream is None:
+                    self._pool = ThreadPoolExecutor(self.threads, "images")
+                else:
+                    self._pool = ThreadPoolExecutor(self.threads, "images", torch.cuda.set_device, (self.device,))
             self._loading[index] = self._pool.submit(self._pinned, index)
 
     def _pinned(self, index: int) -> dict[str, Any]:
@@ -245,7 +256,7 @@ class ImagePrefetcher:
         return _map_tensors(data, lambda tensor: tensor.pin_memory())
 
     def _copy(self, index: int) -> tuple[dict[str, Any], torch.cuda.Event | None]:
-        """Return a view's data on the device, and with CUDA the event of their arrival."""
+        """Begin to copy a view's data to the device; return them, and with CUDA an event that follows the copies."""
         if self.decoded:
             data = dict(self.images[index])
         else:

@@ -49,14 +49,15 @@ class AdamUpdate:
     """
 
     def __init__(self, optimizers: Mapping[str, Adam]) -> None:
-        alike: dict[Any, dict[str, Adam]] = {}
+        alike: dict[tuple[int, Any, float], dict[str, Adam]] = {}  # By length, betas and eps
         self._tables = {name: adam for name, adam in optimizers.items() if isinstance(adam, RowAdam)}
         for name, optimizer in optimizers.items():
             if name in self._tables:
                 continue
             group = optimizer.param_groups[0]
-            alike.setdefault((len(group["params"][0]), group["betas"], group["eps"]), {})[name] = optimizer
-        self._launches: list[tuple[Any, list[str]]] = [(key, list(chosen)) for key, chosen in alike.items()]
+            key = (len(group["params"][0]), group["betas"], group["eps"])
+            alike.setdefault(key, {})[name] = optimizer
+        self._launches = [(key, list(chosen)) for key, chosen in alike.items()]
         self._optimizers = {name: adam for chosen in alike.values() for name, adam in chosen.items()}
         self._optimizers |= self._tables
         self._groups = [adam.param_groups[0] for adam in self._optimizers.values()]
@@ -85,12 +86,16 @@ class AdamUpdate:
         return [*self.parameters.values(), *self.exp_avgs, *self.exp_avg_sqs, *counts]
 
     def factors(self) -> Tensor:
-        """Count an update of each parameter, and return our kernel's factors, on the (pinned) host. float32 [2, P]"""
+        """Count an update of each parameter, and return the factors of `rate_and_scale` for our kernel.
+
+        They are float32 [2, P] on the host, in pinned memory with CUDA, and [2, 0] where torch's Adam is used. Tables
+        come last, with their learning rates and 1.
+        """
         if not self._triton:
             return torch.empty((2, 0))
         from sadgs_ns.kernels.adam import rate_and_scale
 
-        columns = []
+        columns = []  # Two factors of each parameter
         for name, group, state in zip(self.parameters, self._groups, self._states, strict=True):
             if name in self._tables:  # The device counts the updates of each row.
                 columns.append((group["lr"], 1.0))
@@ -108,10 +113,14 @@ class AdamUpdate:
         overflowed: tuple[Tensor, ...] = (),
         rows: RowUpdate | None = None,
     ) -> None:
-        """Update the parameters by gradients of their names; `nonfinite_flag` [1] becomes NaN if one was not finite.
+        """Update the parameters by gradients, given by the parameters' names.
 
-        `factors` are on the device, and `overflowed` is as for `kernels.adam.adam_step`; torch's Adam ignores both.
-        `rows` say what of a table is moved; without them tables stay.
+        Args:
+            gradients: Each has its parameter's shape.
+            factors: From `factors`, on the device; torch's Adam ignores them. [2, P]
+            nonfinite_flag: Becomes NaN if a gradient is not finite. [1]
+            overflowed: As for `kernels.adam.adam_step`; torch's Adam ignores it.
+            rows: The rows of the tables that are moved, and how far. Without it the tables stay.
         """
         if rows is not None:
             self._move_tables(gradients, factors, nonfinite_flag, rows)
@@ -131,23 +140,23 @@ class AdamUpdate:
             part = slice(begin, begin + len(names))
             begin = begin + len(names)
             parameters = tuple(self.parameters[name] for name in names)
-            in_order = tuple(gradients[name].contiguous() for name in names)
+            chosen = tuple(gradients[name].contiguous() for name in names)
             adam_step(
-                parameters, in_order, self.exp_avgs[part], self.exp_avg_sqs[part], factors[:, part], nonfinite_flag,
+                parameters, chosen, self.exp_avgs[part], self.exp_avg_sqs[part], factors[:, part], nonfinite_flag,
                 overflowed, betas=betas, eps=eps, max_gradient=MAX_GRADIENT,
             )  # fmt: skip
 
     def _move_tables(
         self, gradients: Mapping[str, Tensor], factors: Tensor, nonfinite_flag: Tensor, rows: RowUpdate
     ) -> None:
-        """Update the tables, whose factors are the last ones."""
+        """Update the tables, whose columns of `factors` are the last ones."""
         first = len(self.parameters) - len(self._tables)
-        for place, (name, adam) in enumerate(self._tables.items(), first):
+        for column, (name, adam) in enumerate(self._tables.items(), first):
             table = self.parameters[name]
             group = adam.param_groups[0]
             rate: Tensor | float = group["lr"]
             if self._triton:
-                rate = factors[0, place]
+                rate = factors[0, column]
             move_rows(
                 table, gradients[name], adam.state[table], rows, rate, group["betas"], group["eps"], nonfinite_flag
             )

@@ -26,7 +26,10 @@ class RowUpdate(NamedTuple):
 def empty_moments(
     table: Tensor,  # [V, D]
 ) -> dict[str, Tensor]:
-    """Return Adam's state of a table that was not updated yet: two moments [V, D] and each row's updates [V]."""
+    """Return Adam's state of a table before its first update.
+
+    It has two moments [V, D], and the number of each row's updates [V].
+    """
     return {
         "exp_avg": torch.zeros_like(table),
         "exp_avg_sq": torch.zeros_like(table),
