@@ -168,10 +168,9 @@ class Group:
         return {index: place for place, index in enumerate(self.members)}
 
     @cached_property
-    def planes(self) -> Tensor:
-        """Greatest difference near each pixel, depth, and 1 where the photo is valid. [V, 3, h, w]"""
-        near = F.max_pool2d(self.difference[:, None], WINDOW, 1, WINDOW // 2)[:, 0]
-        return torch.stack([near, self.depth, self.valid.to(near)], dim=1)
+    def greatest_nearby(self) -> Tensor:
+        """Greatest difference near each pixel. [V, h, w]"""
+        return F.max_pool2d(self.difference[:, None], WINDOW, 1, WINDOW // 2)[:, 0]
 
 
 def grouped(views: Sequence[SmallView]) -> list[Group]:
@@ -327,7 +326,9 @@ def _read(
     x = places[:, 0] * (2 / width) - 1
     y = places[:, 1] * (2 / height) - 1
     grid = torch.stack([x, y], dim=-1)  # From −1 to 1 between the picture's borders. [N, h, w, 2]
-    return F.grid_sample(group.planes[members], grid, mode="nearest", align_corners=False)
+    nearby = group.greatest_nearby[members]
+    planes = torch.stack([nearby, group.depth[members], group.valid[members].to(nearby)], dim=1)
+    return F.grid_sample(planes, grid, mode="nearest", align_corners=False)
 
 
 def spread(
