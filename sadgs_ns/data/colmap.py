@@ -154,9 +154,10 @@ def _read_binary_tracks(path: Path) -> Tracks:
 
 
 def _read_text(path: Path, minimum: int, numbered: bool = True) -> Iterator[tuple[list[str], Iterator[str]]]:
-    """Yield the fields of each line of data, and the lines after it.
+    """Yield the fields of each line that is no comment, and an iterator over the lines after it.
 
-    Raise ValueError for a line with fewer fields than the minimum, or if lines are numbered and two have one number.
+    Lines that the caller takes from this iterator are not yielded. Raise ValueError for a line with fewer fields than
+    the minimum, and, if lines are numbered by their first fields, for two lines with the same number.
     """
     numbers = set[str]()
     with path.open(encoding="utf8") as file:

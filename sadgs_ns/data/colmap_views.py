@@ -48,21 +48,22 @@ def _camera(camera: colmap.Camera, where: str) -> Camera:
     """Return a camera for the checks; raise InputError if nerfstudio cannot read it, or one of its values is wrong."""
     model = camera.model
     params = camera.params
-    number = colmap.CAMERA_PARAMETERS.get(model)
-    if number is None or model in UNSUPPORTED_CAMERAS:
+    num_params = colmap.CAMERA_PARAMETERS.get(model)
+    if num_params is None or model in UNSUPPORTED_CAMERAS:
         problem = f"{where} has the model {model}, which nerfstudio cannot read"
         raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
-    focals = 2
+    num_focals = 2
     if model.startswith("SIMPLE") or "RADIAL" in model:
-        focals = 1
-    values = {"width": camera.width, "height": camera.height}
-    values |= {f"focal length {axis}": value for axis, value in zip("xy", params[:focals], strict=False)}
+        num_focals = 1
+    values: dict[str, float] = {"width": camera.width, "height": camera.height}
+    for axis, focal in zip("xy", params[:num_focals], strict=False):
+        values[f"focal length {axis}"] = focal
     check_positive(values, where, list(values))
-    if not np.isfinite(params).all() or len(params) != number:
-        raise InputError(f"{where} has {params} instead of {number} finite parameters: run COLMAP's mapper again.")
+    if not np.isfinite(params).all() or len(params) != num_params:
+        raise InputError(f"{where} has {params} instead of {num_params} finite parameters: run COLMAP's mapper again.")
     fx = params[0]
-    fy = params[focals - 1]
-    cx, cy, *radial = params[focals:]
+    fy = params[num_focals - 1]
+    cx, cy, *radial = params[num_focals:]
     tangential = []
     if model == "OPENCV":
         *radial, p1, p2 = radial

@@ -92,7 +92,7 @@ def images_in(folder: Path) -> list[Path]:
 def read_header(path: Path) -> Header:
     """Read an image's header, and decode the image only if the end of the file does not show that it is whole.
 
-    A file that cannot be read has a header with a problem.
+    For a file that cannot be read, the header has a problem.
     """
     remedy = "copy it again, or leave it out of the reconstruction"
     try:
@@ -100,11 +100,13 @@ def read_header(path: Path) -> Header:
             return Header(problem=f"has 0 bytes: {remedy}")
         with Image.open(path) as image:
             orientation = 1
-            with suppress(Exception):  # Damaged EXIF matters to no one. A PNG's own method would decode the image.
+            with suppress(Exception):  # An image with damaged EXIF counts as upright.
+                # `image.getexif` would decode a PNG.
                 orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
             has_profile = color_profile(image) is not None
             header = Header(image.size, image.mode, image.format or "", orientation, has_profile)
-            is_unread = image.format == "HEIF" or (image.format == "TIFF" and path.suffix.lower() in UNREAD_SUFFIXES)
+            is_raw = image.format == "TIFF" and path.suffix.lower() in UNREAD_SUFFIXES
+            is_unread = image.format == "HEIF" or is_raw
             is_whole = is_unread or _ends_well(path, image)
         if is_unread:
             return Header(problem=_unread_problem(path))
@@ -135,14 +137,14 @@ def _unread_problem(path: Path) -> str:
 
 
 def _ends_well(path: Path, image: Image.Image) -> bool:
-    """Return whether an open image is whole for sure; if not, only decoding shows whether it is."""
+    """Return whether the file of an open image is surely whole. If not, only decoding shows whether it is."""
     if image.format == "JPEG":
         with path.open("rb") as file:
             file.seek(-2, 2)
             return file.read() == b"\xff\xd9"
     if image.format != "PNG":
         return False
-    with suppress(Exception):  # It raises anything, even if only the last bytes are missing, which decodes well.
+    with suppress(Exception):  # It also fails where only the last bytes are missing, and the image can be decoded.
         image.verify()  # This reads its checksums.
         return True
     return False
@@ -161,7 +163,7 @@ def color_profile(image: Image.Image) -> ImageCms.ImageCmsProfile | None:
     """Return the profile of an image's colours if they are others than sRGB's, such as a phone's Display P3."""
     if image.mode not in ("RGB", "RGBA", "CMYK"):
         return None
-    with suppress(KeyError, OSError, ImageCms.PyCMSError):  # Most have none, and some a damaged one.
+    with suppress(KeyError, OSError, ImageCms.PyCMSError):  # Most images have no profile, and some a damaged one.
         profile = ImageCms.ImageCmsProfile(io.BytesIO(image.info["icc_profile"]))
         if "sRGB" not in ImageCms.getProfileDescription(profile):
             return profile

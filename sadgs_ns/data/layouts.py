@@ -40,7 +40,7 @@ class ParserOptions:
 
 
 def layout_of(data: Path) -> Literal["nerfstudio", "blender", "colmap"] | None:
-    """Return the layout of a capture's folder or file; None if it is unknown."""
+    """Return the layout of a capture's folder or file, or None if it is unknown; raises as `find_reconstructions`."""
     if data.is_file() or (data / "transforms.json").is_file():
         return "nerfstudio"
     if (data / "transforms_train.json").is_file():
@@ -61,7 +61,8 @@ def find_reconstructions(data: Path) -> dict[Path, list[str]]:
     """Return the folders of COLMAP's reconstructions, relative to the data, and the names of each one's images.
 
     The first is the one to read: one in a usual place, or else the one with the most images. A reconstruction directly
-    in the data's folder counts if there is no other and its images are there. One that cannot be read has no names.
+    in the data's folder counts if there is no other and its images are there. Raise InputError if its poses cannot be
+    read. One elsewhere that cannot be read has no names.
     """
     models: dict[Path, list[str]] = {}
     for folder in _model_folders(data):
@@ -78,7 +79,10 @@ def find_reconstructions(data: Path) -> dict[Path, list[str]]:
 
 
 def _model_folders(data: Path) -> list[Path]:
-    """Return the folders of a capture that have a file of COLMAP's cameras, the usual ones first."""
+    """Return the folders of a capture that have a file of COLMAP's cameras, the usual ones first.
+
+    Raises as `find_reconstructions`.
+    """
     folders = [Path(name) for name in (*COLMAP_FOLDERS, "images")]
     for parent in ("colmap/sparse", "sparse"):
         folders += [path.relative_to(data) for path in sorted((data / parent).glob("[0-9]*"))]
@@ -94,7 +98,7 @@ def _model_folders(data: Path) -> list[Path]:
 
 
 def find_cameras(data: Path) -> Path | None:
-    """Return the file with the poses of a folder or JSON file, or None; raises as `colmap.read_poses`."""
+    """Return the file with the poses of a folder or JSON file, or None; raises as `find_reconstructions`."""
     for path in (transforms_path(data), data / "transforms_train.json"):
         if path.is_file():
             return path

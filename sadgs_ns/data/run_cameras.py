@@ -19,7 +19,7 @@ from sadgs_ns.errors import InputError, reason
 
 @dataclass(frozen=True)
 class RunCameras:
-    """C cameras in the frame of training, as pinholes; the distortion of their photos is told beside."""
+    """C cameras in the frame of training: pinholes, and the distortion of their photos."""
 
     camera_to_worlds: Tensor  # OpenGL axes (x right, y up, z backward). [C, 3, 4]
     Ks: Tensor  # Intrinsics in px. [C, 3, 3]
@@ -38,12 +38,13 @@ class _PlainLoader(yaml.SafeLoader):
     """Reads Python objects as the mappings, lists, paths and texts that they are in the file, and makes no object."""
 
 
-def _plain(loader: _PlainLoader, kind: str, node: yaml.Node) -> Any:
+def _plain(loader: _PlainLoader, tag: str, node: yaml.Node) -> Any:
+    """Construct a node of a Python object without the object; `tag` is the rest of its tag after "python/"."""
     if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True) | {_CLASS: kind.removeprefix("object:")}
+        return loader.construct_mapping(node, deep=True) | {_CLASS: tag.removeprefix("object:")}
     if isinstance(node, yaml.SequenceNode):
         values = loader.construct_sequence(node, deep=True)
-        if kind.startswith("object/apply:pathlib."):
+        if tag.startswith("object/apply:pathlib."):
             return Path(*values)
         return values
     return loader.construct_scalar(node)  # type: ignore[arg-type]
@@ -103,7 +104,8 @@ def _make_parser(settings: Mapping[str, Any], data: Path) -> Any:
 def _parse(settings: Mapping[str, Any], data: Path, may_be_other: bool) -> Any:
     """Parse the training views of a capture with settings for `_make_parser`.
 
-    If that fails and the folder may have another layout than the settings are for, use the parser that fits.
+    If that fails and `may_be_other`, the folder may have another layout than the settings are for: then the parser that
+    fits the folder is used.
     """
     try:
         return _make_parser(settings, data).get_dataparser_outputs(split="train")
@@ -112,7 +114,7 @@ def _parse(settings: Mapping[str, Any], data: Path, may_be_other: bool) -> Any:
             raise
         fitting = _make_parser({}, data)
         if settings.get(_CLASS, "").endswith(f".{type(fitting.config).__qualname__}"):
-            raise  # The folder may hold another COLMAP model than the run's, whose frame is another.
+            raise  # With its defaults the same parser may read another COLMAP model than the run's, in another frame.
         return fitting.get_dataparser_outputs(split="train")
 
 
@@ -134,8 +136,8 @@ def _locate(run: Path, data: Path | None) -> tuple[Path, dict[str, Any]]:
 def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
     """Read a run's training cameras in its frame, with the run's parser, or one that fits if the run names none.
 
-    `data` is the capture's folder, by default where the run's `config.yml` says that it was. Raise InputError if the
-    capture cannot be read, or the run does not tell how it moved it.
+    `data` is the capture's folder, by default the one in the run's `config.yml`. Raise InputError if the capture cannot
+    be read, or the run's `dataparser_transforms.json` cannot.
     """
     folder, settings = _locate(run, data)
     try:
@@ -145,7 +147,7 @@ def read_cameras(run: Path, data: Path | None = None) -> RunCameras:
         raise InputError(f"{problem}: give another with --data.") from error
     cameras = outputs.cameras
     poses = cameras.camera_to_worlds.double().numpy()  # [C, 3, 4]
-    if (run / TRANSFORMS_NAME).is_file():  # The run's own options may have moved the capture otherwise.
+    if (run / TRANSFORMS_NAME).is_file():  # The run's options may have moved the capture in another way.
         to_frame = Similarity.of(outputs.dataparser_scale * outputs.dataparser_transform.double().numpy())
         poses = to_frame.inverse().poses(poses)
         poses = from_data(run / TRANSFORMS_NAME).poses(poses)

@@ -14,11 +14,12 @@ from torch import Tensor
 
 from sadgs_ns.data.coordinates import FRAME_KEYS, Similarity, fixed_frame
 from sadgs_ns.errors import InputError
-from sadgs_ns.geometry.outliers import span_space
+from sadgs_ns.geometry.outliers import has_enough_places
 
 POINTS_FILE = "points3D_file"
 """Key of a parser's metadata: the file of a COLMAP reconstruction from which all its points were read, in its order."""
-_FAR = 10.0  # Poses farther from the origin than so many of their extents are centred.
+_FAR = 10.0  # Poses that lie farther than this from the origin are centred, in extents of the poses.
+_TOO_FAR = 1000.0  # Poses that lie farther than this from the origin are coarse in float32, in extents of the poses.
 
 
 class Centring(NamedTuple):
@@ -29,16 +30,17 @@ class Centring(NamedTuple):
 
 
 def centre_poses(meta: Mapping[str, Any], method: str) -> Centring:
-    """Move the poses of frames to the origin if they are far from it, as on a map; the others stay.
+    """Move the poses of frames to the origin if all are far from it, as in a map's coordinates, or else leave them.
 
-    nerfstudio rounds poses to float32 before it centres them. Raise InputError if the parser's `center_method` is none
-    and the cameras are so far away that this rounds coarsely.
+    Without this nerfstudio would round such poses to float32 before it centres them. They also stay if `method`, the
+    parser's `center_method`, is "none". Raise InputError if the cameras are then so far away that float32 is too
+    coarse.
     """
     poses = np.array([frame["transform_matrix"] for frame in meta["frames"]], np.float64)  # [V, 4, 4]
     middle = np.median(poses[:, :3, 3], axis=0)  # [3]
     distance = np.abs(middle).max()
     extent = np.ptp(poses[:, :3, 3], axis=0).max()
-    if method == "none" and distance > 1000 * extent:
+    if method == "none" and distance > _TOO_FAR * extent:
         raise InputError("--center-method none leaves the cameras where float32 rounds their places: leave it out.")
     if method == "none" or distance <= _FAR * extent:
         middle = np.zeros(3)
@@ -86,11 +88,11 @@ def points_in_the_run(
 ) -> dict[str, Tensor]:
     """Return points [P, 3] and their colours in 0 … 255 [P, 3] as nerfstudio's metadata hold them in the run's frame.
 
-    Points that span no space are left out, so that the run starts as without points.
+    Points in too few places are left out, so that the run starts as without points.
 
     The transform [3, 4] maps the data's frame to the run's; the scale is applied after it.
     """
-    if not span_space(positions):
+    if not has_enough_places(positions):
         return {}
     with np.errstate(over="ignore"):  # Numbers beyond float32 become infinite, and are left out later.
         positions = positions.astype(np.float32)

@@ -108,9 +108,9 @@ class TransformsParser(Nerfstudio):
         return [frames[index] for index in np.argsort(names)]  # type: ignore[arg-type]
 
     def _files(self, frames: Sequence[dict[str, Any]], key: str, smaller: str, folder: Path) -> list[Path]:
-        """Return the file that each frame names by a key; none if no frame has it, ValueError if only some have it.
+        """Return the files that frames name by a key, or nothing if no frame has it; ValueError if only some have it.
 
-        `smaller` is the start of the name of the folder that has smaller copies.
+        Names of folders with smaller copies start with `smaller`.
         """
         files = [self._get_fname(Path(frame[key]), folder, smaller) for frame in frames if key in frame]
         if len(files) not in (0, len(frames)):

@@ -19,6 +19,9 @@ from sadgs_ns.render.types import Projected
 _GRADIENTS = (2, 3, 1, 3, 2, 1)
 """Widths of our compositing's columns of gradients: centre, conic, opacity, colour, absolute centre, unused."""
 
+_NUM_TENSORS = 6
+"""The first fields of `Projected` are tensors, one row for each Gaussian."""
+
 
 class Exchange:
     """Sends the Gaussians that each band draws to the process that composites it.
@@ -65,16 +68,19 @@ class Exchange:
     def send(self, projected: Projected, absgrad: bool) -> tuple[Tensor, list[Projected]]:
         """Send the Gaussians, differentiably; call once.
 
-        With `absgrad`, `backward` sets `absgrad` and `grad2d` of `means2d`, its absolute gradients and its gradient.
-        Returns zero, which must be added to the loss so that gradients come to a process that composites nothing; and
-        the Gaussians of each band of this process, one view each, shifted to the first drawn row.
+        With `absgrad`, `backward` gives `projected.means2d` the attributes `absgrad`, its absolute gradients, and
+        `grad2d`, its gradient.
+
+        Returns:
+            Zero, which must be added to the loss, so that backward runs in a process that composites nothing, too; and
+            for each band of this process the Gaussians of its view, shifted to the band's first drawn row.
         """
         if absgrad:
             projected.means2d.grad2d = None  # type: ignore[attr-defined] # `keep_gradient` looks for it.
-        anchor, *flat = _Exchanged.apply(self, absgrad, *projected[:6])  # type: ignore[misc]
+        anchor, *flat = _Exchanged.apply(self, absgrad, *projected[:_NUM_TENSORS])  # type: ignore[misc]
         received = []
         for index, band in enumerate(self.bands):
-            tensors = flat[6 * index : 6 * index + 6]
+            tensors = flat[_NUM_TENSORS * index : _NUM_TENSORS * (index + 1)]
             height = band.bottom - band.top
             received.append(Projected(*tensors, width=projected.width, height=height))
         if absgrad and torch.is_grad_enabled():

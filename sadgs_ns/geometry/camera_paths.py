@@ -104,14 +104,14 @@ class CameraPaths:
             most = int(counts.max())
         for part in candidates.split(_PAIRS // most + 1):
             # K pairs of a position and each of its paths.
-            which = part.repeat_interleave(counts[part])  # [K]
+            indices = part.repeat_interleave(counts[part])  # Of the pairs' positions. [K]
             pairs_before = counts[part].cumsum(dim=0) - counts[part]
             pairs_before = pairs_before.repeat_interleave(counts[part])  # [K]
-            pairs = torch.arange(len(which), device=which.device)
+            pairs = torch.arange(len(indices), device=indices.device)
             number = pairs - pairs_before  # 0 for the first path of a position, and so on
-            paths = nearby.paths[nearby.firsts[which] + number]
-            distances = _distances(means[which], self.starts[paths], self.ends[paths])
-            from_path.scatter_reduce_(0, which, distances, "amin")
+            paths = nearby.paths[nearby.firsts[indices] + number]
+            distances = _distances(means[indices], self.starts[paths], self.ends[paths])
+            from_path.scatter_reduce_(0, indices, distances, "amin")
         return from_path
 
 
@@ -124,7 +124,7 @@ def _connect_neighbours(
     """Connect each camera with itself, and with its nearest neighbours that look in a similar direction.
 
     Returns:
-        Pairs of cameras, none twice. int64 [E, 2]
+        Pairs of different indices of cameras in ascending order, and (i, i) for each camera; none twice. int64 [E, 2]
     """
     distances = torch.cdist(centres, centres)  # [C, C]
     is_unlike = viewing_axes @ viewing_axes.T < math.cos(math.radians(SIMILAR_DEGREES))
@@ -132,8 +132,10 @@ def _connect_neighbours(
     distances.masked_fill_(is_unlike | is_same_place, torch.inf)
     distances.fill_diagonal_(torch.inf)
     nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
-    usual = float(nearest.values[:, :1].median())  # NaN for a single camera
-    unit = max(near_plane, usual)
+    median = float(nearest.values[:, :1].median())  # NaN for a single camera
+    unit = near_plane
+    if median > near_plane:
+        unit = median
     longest = LONGEST * unit
     cameras = torch.arange(len(centres))[:, None]
     pairs = torch.stack([cameras.expand_as(nearest.indices), nearest.indices], dim=-1)
@@ -203,11 +205,12 @@ def _distances(
     starts: Tensor,  # [K, 3]
     ends: Tensor,  # [K, 3]
 ) -> Tensor:
-    """Distance of each position from its straight path. [K]"""
-    ways = ends - starts
-    away = positions - starts
-    squares = ways.square().sum(dim=1).clamp_min(torch.finfo(ways.dtype).tiny)
-    products = (away * ways).sum(dim=1)
-    along = products / squares
+    """Distance of each position from the straight path that belongs to it, from its start to its end. [K]"""
+    paths = ends - starts
+    from_starts = positions - starts
+    squared_lengths = paths.square().sum(dim=1).clamp_min(torch.finfo(paths.dtype).tiny)
+    products = (from_starts * paths).sum(dim=1)
+    along = products / squared_lengths
     along = along.clamp(0, 1)  # Nearest place of the path: 0 is its start, and 1 its end.
-    return torch.addcmul(away, along[:, None], ways, value=-1).norm(dim=1)
+    from_paths = torch.addcmul(from_starts, along[:, None], paths, value=-1)
+    return from_paths.norm(dim=1)

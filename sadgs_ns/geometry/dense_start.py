@@ -150,7 +150,7 @@ def _compare(
 
 
 def _project(points: Tensor, viewmat: Tensor, depths: DepthMap) -> tuple[Tensor, Tensor]:
-    """Depths of points [Q, 3] in a view [Q], and their places as shares of its width and height [Q, 2]."""
+    """Return the depths of points [Q, 3] in a view [Q], and their places as shares of its width and height [Q, 2]."""
     in_camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
     depth = in_camera[:, 2]
     height, width = depths.depth.shape
@@ -164,10 +164,10 @@ def _read(
     values: Tensor,  # [H, W, D]
     places: Tensor,  # shares of width and height [Q, 2]
 ) -> Tensor:
-    """Return the values of the pixels at these places, or of the nearest ones at the border. [Q, D]"""
+    """Return the value of the pixel at each place; outside the picture, that of the nearest border pixel. [Q, D]"""
     height, width = values.shape[:2]
     pixels = places * places.new_tensor([width, height])
-    pixels = pixels.nan_to_num(0.0).clamp(-1, 1e6).long()
+    pixels = pixels.nan_to_num(0.0).clamp(-1, 1e6).long()  # Larger numbers would overflow integers.
     columns, rows = pixels.unbind(1)
     rows = rows.clamp(0, height - 1)
     columns = columns.clamp(0, width - 1)

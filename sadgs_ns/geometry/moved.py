@@ -81,12 +81,12 @@ class Spread:
 
     @property
     def strong(self) -> float:
-        """Excess of pixels that are a region's reason."""
+        """Excess from which pixels are strong."""
         return max(self.median + STRONG * self.deviation, LEAST_EXCESS)
 
     @property
     def weak(self) -> float:
-        """Excess up to which a region reaches."""
+        """Excess from which pixels are weak."""
         return max(self.median + WEAK * self.deviation, LEAST_EXCESS * WEAK / STRONG)
 
 
@@ -106,15 +106,15 @@ def difference(
 ) -> Tensor:
     """Differences between small photos and their renderings, 0 where a photo is hidden. [V, h, w]
 
-    They are the distances of smoothed colours, at the shift of a pixel at most where they are closest, so that edges
-    that lie a little beside their place do not count; and their means over a window.
+    A pixel's difference is the distance of the smoothed colours, at the closest of the shifts by `SHIFT` px at most, so
+    that edges that lie a little beside their place do not count. The result is its mean over a window.
     """
     weight = valid.to(photos)[:, None]  # [V, 1, h, w]
     photos = _smoothed(photos, weight, 3)
     drawn = _smoothed(drawn, weight, 3)
-    number, height, width = valid.shape
+    num_views, height, width = valid.shape
     padded = F.pad(drawn, (SHIFT, SHIFT, SHIFT, SHIFT), mode="replicate")
-    shifted = F.unfold(padded, 2 * SHIFT + 1).view(number, 3, -1, height, width)
+    shifted = F.unfold(padded, 2 * SHIFT + 1).view(num_views, 3, -1, height, width)
     squares = (photos[:, :, None] - shifted).square().mean(dim=1)  # At each shift. [V, shifts, h, w]
     least = squares.amin(dim=1, keepdim=True).sqrt()
     return (_smoothed(least, weight, WINDOW) * weight)[:, 0]
@@ -139,10 +139,10 @@ def _smoothed(
     side: int,  # px, odd
 ) -> Tensor:
     """Weighted means of images over windows; 0 where a window has no weight. [V, C, h, w]"""
-    both = torch.cat([images * weight, weight], dim=1)
-    of_columns = F.avg_pool2d(both, (side, 1), 1, (side // 2, 0), count_include_pad=False)
-    sums = F.avg_pool2d(of_columns, (1, side), 1, (0, side // 2), count_include_pad=False)
-    return sums[:, :-1] / sums[:, -1:].clamp_min(_TINY)
+    weighted = torch.cat([images * weight, weight], dim=1)  # [V, C + 1, h, w]
+    of_columns = F.avg_pool2d(weighted, (side, 1), 1, (side // 2, 0), count_include_pad=False)
+    means = F.avg_pool2d(of_columns, (1, side), 1, (0, side // 2), count_include_pad=False)
+    return means[:, :-1] / means[:, -1:].clamp_min(_TINY)
 
 
 @dataclass(frozen=True)
@@ -189,14 +189,14 @@ def grouped(views: Sequence[SmallView]) -> list[Group]:
 
 
 def surface_points(groups: Sequence[Group]) -> Tensor:
-    """Return points of what the views draw, evenly over views and pixels, in world space. float64 [P, 3]"""
+    """Return points on the drawn surfaces, evenly over views and pixels, in world space. float64 [P, 3]"""
     num_views = sum(len(group.members) for group in groups)
-    of_each = max(_POINTS // num_views, 2)
+    points_per_view = max(_POINTS // num_views, 2)
     points = []
     for group in groups:
         height, width = group.size
-        every = max(height * width // of_each, 1)
-        chosen = torch.arange(every // 2, height * width, every, device=group.depth.device)
+        step = max(height * width // points_per_view, 1)
+        chosen = torch.arange(step // 2, height * width, step, device=group.depth.device)
         depth = group.depth.flatten(1)[:, chosen].double()  # [V, P]
         x = chosen % width + 0.5
         y = torch.div(chosen, width, rounding_mode="floor") + 0.5
@@ -205,16 +205,16 @@ def surface_points(groups: Sequence[Group]) -> Tensor:
         ray_y = (y - K[:, 1, 2]) / K[:, 1, 1]
         in_camera = torch.stack([ray_x * depth, ray_y * depth, depth], dim=1)  # [V, 3, P]
         to_world = group.viewmat.double().inverse()
-        places = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]
-        points.append(places.mT[depth > 0])
+        in_world = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]  # [V, 3, P]
+        points.append(in_world.mT[depth > 0])
     return torch.cat(points)
 
 
 def excesses(groups: Sequence[Group], neighbours: Sequence[Sequence[int]]) -> list[Tensor]:
-    """Differences of views beyond those of their neighbours; NaN where too few of them see the point. [h, w] each
+    """Subtract neighbours' differences from those of views; NaN where too few of them see the point. [h, w] each
 
-    A neighbour that sees a point, or looks through its place at something behind it, tells the point's difference. One
-    in which something nearer hides the point tells nothing.
+    A neighbour counts if it sees the point, or looks through its place at something behind it. One in which something
+    nearer hides the point does not count.
 
     Args:
         groups: All views.
@@ -230,11 +230,12 @@ def excesses(groups: Sequence[Group], neighbours: Sequence[Sequence[int]]) -> li
         for start in range(0, len(group.members), together):
             part = slice(start, start + together)
             indices = group.members[part]
-            told = _carried(group, part, [neighbours[index] for index in indices], groups)
-            enough = told.isfinite().sum(dim=1) >= FEWEST_SEEING
-            enough &= group.valid[part]
-            beyond = group.difference[part] - _upper(told)
-            for index, values in zip(indices, torch.where(enough, beyond, math.nan), strict=True):
+            carried = _carried(group, part, [neighbours[index] for index in indices], groups)
+            known = carried.isfinite().sum(dim=1) >= FEWEST_SEEING
+            known &= group.valid[part]
+            excess = group.difference[part] - _upper(carried)
+            excess = torch.where(known, excess, math.nan)
+            for index, values in zip(indices, excess, strict=True):
                 found[index] = values
     return [found[index] for index in range(len(neighbours))]
 
@@ -256,9 +257,9 @@ def _carried(
     neighbours: Sequence[Sequence[int]],  # Of each of them, its neighbours' places among all views
     groups: Sequence[Group],  # All views
 ) -> Tensor:
-    """Return the differences of neighbours at the points of views.
+    """Return the differences of neighbours at the points of views. [V, NEIGHBOURS, h, w]
 
-    NaN where they tell nothing, and where a view has fewer than `NEIGHBOURS`. [V, NEIGHBOURS, h, w]
+    NaN where a neighbour does not count, and in place of those that a view has fewer than `NEIGHBOURS`.
     """
     height, width = group.size
     depth = group.depth[part][:, None]  # [V, 1, h, w]
@@ -268,30 +269,31 @@ def _carried(
     y = torch.arange(height, device=depth.device) + 0.5
     ray_x = ((x - K[:, 0, 2, None]) / K[:, 0, 0, None])[:, None, :]  # [V, 1, w]
     ray_y = ((y - K[:, 1, 2, None]) / K[:, 1, 1, None])[:, :, None]  # [V, h, 1]
-    told = torch.full((len(K), NEIGHBOURS, height, width), math.nan, device=depth.device)
+    carried = torch.full((len(K), NEIGHBOURS, height, width), math.nan, device=depth.device)
     for other in groups:
         views, slots, members = _pairs(neighbours, other)
         if not views:
             continue
         pairs = other.viewmat[members].double() @ to_world[views]
-        to = pairs.float()[:, :3, :, None, None]  # [pairs, 3, 4, 1, 1]
+        to_other = pairs.float()[:, :3, :, None, None]  # [pairs, 3, 4, 1, 1]
         # No matrix product, since TF32 would round it to 10 bits.
-        turned_x = to[:, :, 0] * ray_x[views][:, None]
-        turned_y = to[:, :, 1] * ray_y[views][:, None]
-        turned = turned_x + turned_y + to[:, :, 2]  # [pairs, 3, h, w]
-        point = turned * depth[views] + to[:, :, 3]  # [pairs, 3, h, w]
-        far = point[:, 2].clamp_min(_TINY)  # [pairs, h, w]
-        of_other = other.K[members]
-        focal = of_other.diagonal(dim1=1, dim2=2)[:, :2, None, None]
-        places = focal * point[:, :2] / far[:, None] + of_other[:, :2, 2, None, None]  # px. [pairs, 2, h, w]
+        turned_x = to_other[:, :, 0] * ray_x[views][:, None]
+        turned_y = to_other[:, :, 1] * ray_y[views][:, None]
+        turned = turned_x + turned_y + to_other[:, :, 2]  # [pairs, 3, h, w]
+        point = turned * depth[views] + to_other[:, :, 3]  # In the axes of the other's camera. [pairs, 3, h, w]
+        point_depth = point[:, 2].clamp_min(_TINY)  # [pairs, h, w]
+        other_K = other.K[members]
+        focal = other_K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
+        centre = other_K[:, :2, 2, None, None]
+        places = focal * point[:, :2] / point_depth[:, None] + centre  # px. [pairs, 2, h, w]
         value, drawn, sees = _read(other, members, places).unbind(dim=1)
         # Where nothing is drawn, nothing hides the point.
-        known = (far < HIDDEN_DEPTH * drawn) | (drawn == 0)
+        known = (point_depth < HIDDEN_DEPTH * drawn) | (drawn == 0)
         known &= sees > 0
         known &= point[:, 2] > 0
         known &= depth[views][:, 0] > 0
-        told[views, slots] = torch.where(known, value, math.nan)
-    return told
+        carried[views, slots] = torch.where(known, value, math.nan)
+    return carried
 
 
 def _pairs(neighbours: Sequence[Sequence[int]], other: Group) -> tuple[list[int], list[int], list[int]]:
@@ -333,8 +335,8 @@ def spread(
 ) -> Spread:
     """Return median and spread of the excess over all views; both are 0 where nothing could be compared."""
     total = sum(values.numel() for values in excesses)
-    every = math.ceil(total / _SAMPLES)
-    sampled = torch.cat([values.flatten()[::every] for values in excesses])
+    step = math.ceil(total / _SAMPLES)
+    sampled = torch.cat([values.flatten()[::step] for values in excesses])
     sampled = sampled[sampled.isfinite()]
     if not len(sampled):
         return Spread(0.0, 0.0)
@@ -362,7 +364,7 @@ def candidates(
 
 
 def _smallest(num_pixels: int) -> float:
-    """Return how many strong pixels a region has at least, in a photo of so many pixels."""
+    """Return the least number of strong pixels of a region, in a photo of this many pixels."""
     return max(SMALLEST_SHARE * num_pixels, _FEWEST_PIXELS)
 
 
@@ -373,8 +375,8 @@ def region(
 ) -> NDArray[np.bool_] | None:
     """Return where something moved in a view; None if nothing did. bool [h, w]
 
-    A region is of connected pixels beyond the weak limit of which enough are beyond the strong one. It differs in
-    structure, not in brightness alone. It is dilated, and has no holes.
+    A region consists of connected weak pixels. Enough of them are strong, and enough of the strong ones differ in
+    structure, not in brightness alone. It is dilated, and its holes are filled.
     """
     marks = _marks(view, values, limits).cpu().numpy()
     weak = (marks & _WEAK) // _WEAK
@@ -393,16 +395,16 @@ def _marks(
     values: Tensor,  # Excess of the view; NaN where unknown [h, w]
     limits: Spread,
 ) -> Tensor:
-    """Mark with a bit each which pixels are strong, weak, and strong and different in structure. uint8 [h, w]
+    """Mark which pixels are strong, which are weak, and which strong ones differ in structure: a bit each. uint8 [h, w]
 
-    Where the excess is unknown, as before the sky, which has no depth, those count as weak that differ from the
-    rendering by the strong limit more than most of the view: a region goes on over them.
+    The excess is unknown before the sky, for example, which has no depth. There a pixel is weak if its difference is
+    above the view's median by more than the strong limit, so that a region also extends over such pixels.
     """
     known = values.isfinite()
     strong = known & (values > limits.strong)
-    usual = view.difference.median()
-    beyond = view.difference > usual + limits.strong
-    weak = torch.where(known, values > limits.weak, beyond)
+    median = view.difference.median()
+    weak_if_unknown = view.difference > median + limits.strong
+    weak = torch.where(known, values > limits.weak, weak_if_unknown)
     structural = strong & (view.structure > LEAST_EXCESS)
     return _STRONG * strong.byte() + _WEAK * weak.byte() + _STRUCTURAL * structural.byte()
 

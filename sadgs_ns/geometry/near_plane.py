@@ -36,7 +36,8 @@ def scene_near_plane(
 ) -> float:
     """Derive the near plane of a scene in world units, > 0.
 
-    The training camera whose `NEAREST_POINTS`-th nearest SfM point has the least depth decides.
+    It is a share of the least depth at which a training camera has its `NEAREST_POINTS`-th nearest SfM point. If no
+    camera sees so many points, it is a share of the cameras' extent.
 
     Args:
         points: The scene's SfM points. [P, 3]
@@ -53,7 +54,7 @@ def scene_near_plane(
 
 
 def _nearest_depth(points: Tensor, viewmats: Tensor, Ks: Tensor, sizes: Tensor) -> float:
-    """Least depth of the views' `NEAREST_POINTS`-th nearest points, infinite if no view sees so many."""
+    """Return the least depth of the views' `NEAREST_POINTS`-th nearest points; infinite if no view sees so many."""
     step = math.ceil(len(points) / _MOST_POINTS)
     points = points[::step]
     views_at_once = _PAIRS // len(points)

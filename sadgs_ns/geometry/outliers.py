@@ -18,15 +18,16 @@ FEWEST_PLACES = 3
 nothing."""
 
 
-def span_space(
+def has_enough_places(
     positions: NDArray[np.floating],  # [P, 3]
 ) -> bool:
-    """Tell whether finite positions are in `FEWEST_PLACES` or more different places."""
-    others = positions[np.isfinite(positions).all(axis=-1)]
+    """Tell whether the finite ones of positions lie in `FEWEST_PLACES` or more different places."""
+    remaining = positions[np.isfinite(positions).all(axis=-1)]
     for _ in range(FEWEST_PLACES):
-        if len(others) == 0:
+        if len(remaining) == 0:
             return False
-        others = others[(others != others[0]).any(axis=-1)]
+        is_elsewhere = (remaining != remaining[0]).any(axis=-1)
+        remaining = remaining[is_elsewhere]
     return True
 
 

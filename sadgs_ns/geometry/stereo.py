@@ -64,9 +64,10 @@ class _View:
     levels: list[Tensor]
     """Grey value around 0, and 1 where it is valid; both are 0 elsewhere. From fine to coarse. Each [2, h, w]"""
     neighbours: list[int]
-    to: Tensor  # (x, y, 1, inverse depth) → homogeneous place in each neighbour, as `_project` uses it. [N, 3, 4]
-    back: Tensor  # The same from each neighbour to this view. [N, 3, 4]
-    inverse: tuple[float, float]  # Smallest and largest inverse depth
+    to_neighbours: Tensor
+    """(x, y, 1, inverse depth) → homogeneous place in each neighbour, as `_project` uses it. [N, 3, 4]"""
+    from_neighbours: Tensor  # The same from each neighbour to this view. [N, 3, 4]
+    inverse_depths: tuple[float, float]  # The smallest and the largest that are tried
     step: float
     """Inverse depth that moves a pixel by about 1 px at working size in the neighbour with the longest baseline."""
 
@@ -188,29 +189,32 @@ def _mean(
 
 
 def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Tensor, points: Tensor) -> list[_View]:
-    """Find neighbours and ranges of depth. Arguments as `choose_neighbours`; float64; only points on the device."""
+    """Find the neighbours of each view and its range of depths, given the arguments of `choose_neighbours`.
+
+    The cameras are float64 on the host. The points tell by their device where the matrices of the results lie.
+    """
     device = points.device
-    every = math.ceil(max(len(points), 1) / _POINTS)
-    points = points[::every].to(torch.float64)
-    placed = (viewmats.to(device), Ks.to(device), sizes.to(device))
-    neighbours = choose_neighbours(*placed, points).tolist()
-    ranges = _depth_ranges(depths_in_views(points, *placed))
+    point_step = math.ceil(max(len(points), 1) / _POINTS)
+    points = points[::point_step].to(torch.float64)
+    cameras = (viewmats.to(device), Ks.to(device), sizes.to(device))
+    neighbours = choose_neighbours(*cameras, points).tolist()
+    depth_ranges = _depth_ranges(depths_in_views(points, *cameras))
     projections = _projections(viewmats, Ks, sizes)
     inverses = projections.inverse()
     centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
     views = []
     for v, levels in enumerate(pyramids):
         chosen = [n for n in neighbours[v] if n >= 0]
-        to = projections[chosen] @ inverses[v]  # [N, 4, 4]
-        back = projections[v] @ inverses[chosen]
-        to = to[:, :3].to(device, torch.float32)
-        back = back[:, :3].to(device, torch.float32)
-        nearest, farthest = ranges[v]
-        inverse = (0.5 / farthest, 1.5 / nearest)  # Surfaces without points may lie nearer and farther.
+        to_neighbours = projections[chosen] @ inverses[v]  # [N, 4, 4]
+        from_neighbours = projections[v] @ inverses[chosen]
+        to_neighbours = to_neighbours[:, :3].to(device, torch.float32)
+        from_neighbours = from_neighbours[:, :3].to(device, torch.float32)
+        nearest, farthest = depth_ranges[v]
+        inverse_depths = (0.5 / farthest, 1.5 / nearest)  # Surfaces without points may lie nearer and farther.
         baselines = (centres[chosen] - centres[v]).norm(dim=1)
         motions = Ks[chosen, 0, 0] * baselines  # px per inverse depth. [N]
         step = 1 / max(motions.tolist(), default=1.0)
-        views.append(_View(levels, chosen, to, back, inverse, step))
+        views.append(_View(levels, chosen, to_neighbours, from_neighbours, inverse_depths, step))
     return views
 
 
@@ -219,7 +223,7 @@ def _depth_ranges(
 ) -> list[list[float]]:
     """Depths of the nearest and farthest points of each view, without the outermost; NaN if it sees none. [V][2]"""
     known = torch.where(depths.isfinite(), depths, torch.nan)
-    # torch knows no quantile of nothing.
+    # torch raises an error for the quantile of no points.
     known = F.pad(known, (0, 1), value=torch.nan)
     shares = depths.new_tensor([0.005, 0.99])
     return known.nanquantile(shares, dim=1).T.tolist()
@@ -241,8 +245,8 @@ def _solve(view: _View, views: list[_View]) -> tuple[Tensor, Tensor]:
     finest_valid = view.levels[0][1]
     if not view.neighbours:
         return torch.zeros_like(finest_valid), torch.zeros_like(finest_valid)
-    device = view.to.device
-    smallest, largest = view.inverse
+    device = view.to_neighbours.device
+    smallest, largest = view.inverse_depths
     # A step moves a pixel of the coarsest level by about 1 px.
     wanted = math.ceil((largest - smallest) / (view.step * 2 ** (LEVELS - 1)))
     count = max(wanted, 8)
@@ -277,7 +281,7 @@ def _scores(
     """
     image = view.levels[level]
     correlations = []
-    for n, matrix in zip(view.neighbours, view.to, strict=True):
+    for n, matrix in zip(view.neighbours, view.to_neighbours, strict=True):
         correlations.append(_correlation(image, views[n].levels[level], matrix, inverse))
     best = correlations[0]
     second = torch.full_like(best, -1.0)
@@ -291,7 +295,7 @@ def _scores(
 def _correlation(
     image: Tensor,  # a level of a view [2, h, w]
     neighbour: Tensor,  # the same level of its neighbour [2, H, W]
-    matrix: Tensor,  # of `_View.to` [3, 4]
+    matrix: Tensor,  # of `_View.to_neighbours` [3, 4]
     inverse: Tensor,  # inverse depths [D, h, w] or [D, 1, 1]
 ) -> Tensor:
     """NCC of the windows around pixels and around their places in a neighbour, over what is valid in both. [D, h, w]
@@ -333,7 +337,7 @@ def _pixels(
 
 
 def _project(matrix: Tensor, x: Tensor, y: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Project points into another view by `_View.to` or `_View.back` [3, 4].
+    """Project points into another view by a matrix of `_View.to_neighbours` or `from_neighbours` [3, 4].
 
     Their places x and y broadcast to [h, w], and their inverse depths are [D, h, w] or [D, 1, 1]. The results are their
     places in the other view [2, D, h, w], and their depths there times their inverse depths here [D, h, w].
@@ -374,7 +378,7 @@ def _confidence(
 ) -> Tensor:
     """Confidence in a view's inverse depths, in [0, 1]: by their score, and by how many neighbours agree. [h, w]"""
     agreeing = torch.zeros_like(inverse)
-    for to, back, other in zip(view.to, view.back, others, strict=True):
+    for to, back, other in zip(view.to_neighbours, view.from_neighbours, others, strict=True):
         agreeing += _agrees(inverse, other, to, back)
     num_neighbours = len(others)
     most = min(num_neighbours, AGREEING)

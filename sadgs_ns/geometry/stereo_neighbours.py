@@ -61,7 +61,7 @@ def _pair_weights(
     depths: Tensor,  # infinite outside the images [V, P]
     points: Tensor,  # [P, 3]
 ) -> Tensor:
-    """Sum for each two views what they gain from points that both see, at most 1 from each. [V, V]"""
+    """Return for each pair of views its gain, a sum over the points that both see; each adds 1 at most. [V, V]"""
     seen = depths.isfinite()  # [V, P]
     rays = F.normalize(points - centres[:, None], dim=2)  # [V, P, 3]
     scales = Ks[:, :1, 0] / torch.where(seen, depths, 1.0)  # px per world unit. [V, P]
@@ -72,12 +72,14 @@ def _pair_weights(
     for part in views.split(views_at_once):
         cosines = (rays[part, None] * rays).sum(dim=3).clamp(-1, 1)  # [v, V, P]
         angles = cosines.acos().rad2deg()
-        gain = angles / smallest
-        gain = gain.clamp_max(1)
+        # It rises to 1 at the smallest of the best angles, and falls from 1 after the widest of them.
+        of_angle = angles / smallest
+        of_angle = of_angle.clamp_max(1)
         fall = (_WIDEST_ANGLE - angles) / (_WIDEST_ANGLE - widest)
-        gain *= fall.clamp(0, 1)
+        of_angle *= fall.clamp(0, 1)
         ratios = scales[part, None] / scales
-        likeness = torch.minimum(ratios, 1 / ratios)
+        of_scale = torch.minimum(ratios, 1 / ratios)
         both_see = seen[part, None] & seen
-        weights.append((gain * likeness * both_see).sum(dim=2))
+        gains = of_angle * of_scale * both_see
+        weights.append(gains.sum(dim=2))
     return torch.cat(weights)

@@ -13,7 +13,7 @@ _BLOCK = 1024  # Numbers that one program updates
 
 @triton.jit
 def _moments_and_step(g, m, v, rate, scale, beta1, beta2, eps, nonfinite_flag, i, exists, MAX: tl.constexpr):
-    """New moments of a block, and the change of its parameters; notes a gradient that must be left out."""
+    """Return a block's new moments and the change of its parameters; set the flag if a gradient must be left out."""
     usable = tl.abs(g) < MAX  # NaN compares as false
     tl.store(nonfinite_flag + i * 0, float("nan"), exists & ~usable)
     g = tl.where(usable, g, 0.0)
@@ -27,9 +27,11 @@ def _update(
     parameters, gradients, means, squares, rates, scales, nonfinite_flag, overflowed, rows, beta1, beta2, eps,
     WIDTHS: tl.constexpr, FLAGS: tl.constexpr, MAX: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Update a block of one of the parameters, which together are covered by the grid, unless all flags are set.
+    """Update one block of one parameter, unless all flags are set.
 
-    The sizes are computed from `rows`: of a tuple of them Triton would specialise the kernel on which 16 divides.
+    The programs of the grid go through the blocks of the first parameter, then of the second, and so on. A parameter
+    has `rows` times its width in WIDTHS numbers. If the kernel took a tuple of these products, Triton would compile it
+    anew for each choice of those that 16 divides.
     """
     block = tl.program_id(0).to(tl.int64)
     n = rows.to(tl.int64) * WIDTHS[0]
@@ -49,10 +51,10 @@ def _update(
             mean = means[k]
             square = squares[k]
             scale = scales[k]
-    drawn = FLAGS == 0
+    is_step = FLAGS == 0
     for k in tl.static_range(FLAGS):
-        drawn = drawn | (tl.load(overflowed[k]) == 0)
-    n = tl.where(drawn, n, 0)
+        is_step = is_step | (tl.load(overflowed[k]) == 0)
+    n = tl.where(is_step, n, 0)
     rate = tl.load(rate)
     scale = tl.load(scale)
     i = block * BLOCK + tl.arange(0, BLOCK)

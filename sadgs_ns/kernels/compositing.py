@@ -58,21 +58,22 @@ def split4(values):
 def load_gaussians(means2d, conics, colors, opacities, g, FLAWS: tl.constexpr):
     """Load centre and opacity, conic, and colour of the Gaussians with indices g [N, 1] into three blocks [N, 4].
 
-    With FLAWS, 1 stands beside a colour that is not finite, else 0. Triton spreads a block over the threads if it has
-    at least as many values; of a smaller one every thread would load everything.
+    Columns that are left over repeat the one before. With FLAWS, a colour's last column is 1 if the colour is not
+    finite, else 0. The blocks have four columns because Triton spreads only a block with at least as many values as
+    there are threads over these; each thread would load all of a smaller one.
     """
-    k = tl.arange(0, 4)[None, :]
-    centres = tl.load(tl.where(k < 2, means2d + 2 * g + k, opacities + g))
-    k = tl.minimum(k, 2)
-    rgb = tl.load(colors + 3 * g + k)
+    column = tl.arange(0, 4)[None, :]
+    centres = tl.load(tl.where(column < 2, means2d + 2 * g + column, opacities + g))
+    of_three = tl.minimum(column, 2)
+    rgb = tl.load(colors + 3 * g + of_three)
     # A colour that is not finite makes the pixels that see it NaN. Elsewhere its weight is 0, but 0 · NaN would reach
     # the gradients of the Gaussians in front of it: here it counts as 0.
     finite = tl.abs(rgb) < float("inf")
     rgb = tl.where(finite, rgb, 0.0)
     if FLAWS:
         flaw = tl.max(tl.where(finite, 0.0, 1.0), axis=1)[:, None]
-        rgb = tl.where(tl.arange(0, 4)[None, :] == 3, flaw, rgb)
-    return centres, tl.load(conics + 3 * g + k), rgb
+        rgb = tl.where(column == 3, flaw, rgb)
+    return centres, tl.load(conics + 3 * g + of_three), rgb
 
 
 @triton.jit

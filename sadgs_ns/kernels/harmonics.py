@@ -146,14 +146,14 @@ def _forward(
 # The colours' gradients may be parts of rows that begin at no multiple of 16 bytes: Triton would compile a new kernel.
 @triton.jit(do_not_specialize=["n", "num_views", "used", "stride", "row"], do_not_specialize_on_alignment=["v_colors"])
 def _backward(
-    means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_centres,
+    means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_origins,
     n, num_views, used, stride, row,
     POSES: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """Write the gradients, summed over the views; rows of `v_colors` lie `row` numbers apart.
 
-    With POSES, also write minus the gradients by the cameras' centres, summed over this program's Gaussians.
-    [C, programs, 3]
+    With POSES, also write the gradients by each view's Rᵀ t, which is minus the camera's centre, summed over this
+    program's Gaussians. [C, programs, 3]
     """
     g, channel = _threads(tl.program_id(0), LANES)
     mine = (g < n) & (channel < 3)
@@ -195,7 +195,7 @@ def _backward(
         v_y += by_y
         v_z += by_z
         if POSES:
-            part = v_centres + 3 * (tl.cast(view, tl.int64) * tl.num_programs(0) + tl.program_id(0))
+            part = v_origins + 3 * (tl.cast(view, tl.int64) * tl.num_programs(0) + tl.program_id(0))
             store3(part, 0, tl.sum(by_x), tl.sum(by_y), tl.sum(by_z), True)
     tl.store(v_first + 3 * g + channel, 0.2820947917738781 * v_sum, mine)
     for k in tl.static_range(15):
@@ -227,22 +227,23 @@ class _Colors(torch.autograd.Function):
         num_views, n = radii.shape[:2]
         v_means = torch.empty_like(means)
         v_first = torch.empty_like(means)
-        # The kernel writes up to degree MAX_DEGREE; beyond that nothing depends on coefficients.
-        written = rest.shape[1] < (MAX_DEGREE + 1) ** 2
-        v_rest = torch.empty_like(rest) if written else torch.zeros_like(rest)
+        if rest.shape[1] < (MAX_DEGREE + 1) ** 2:
+            v_rest = torch.empty_like(rest)
+        else:  # The kernel does not write beyond MAX_DEGREE, where no colour depends on the coefficients.
+            v_rest = torch.zeros_like(rest)
         v_colors, row = equally_spaced_rows(v_colors, colors)
         programs = cdiv(n, _LANES)
         moves_cameras = ctx.needs_input_grad[3]
-        sums = means  # The kernel does not read what stands in.
+        v_origins = means  # Without POSES the kernel ignores this argument, so any tensor will do.
         if moves_cameras:
-            sums = means.new_empty((num_views, programs, 3))
+            v_origins = means.new_empty((num_views, programs, 3))
         _backward[programs,](
-            means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, sums,
+            means, viewmats, rest, radii, colors, v_colors, v_means, v_first, v_rest, v_origins,
             n, num_views, ctx.used, rest.shape[1] * 3, row, moves_cameras, radii.dim() - 1, _LANES,
         )  # fmt: skip
         v_viewmats = None
         if moves_cameras:
-            v_viewmats = _by_matrices(viewmats, sums.sum(dim=1))
+            v_viewmats = _by_matrices(viewmats, v_origins.sum(dim=1))
         return v_means, v_first, v_rest, v_viewmats, None, None
 
 

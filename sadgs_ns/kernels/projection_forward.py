@@ -58,9 +58,9 @@ def _project_forward(
     n, num_views, width, height, near_plane,
     FAR: tl.constexpr, BLUR: tl.constexpr, PER_GAUSSIAN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
-    """Write what each view sees of LANES Gaussians; only radii are written of what is not drawn.
+    """Project LANES Gaussians into each view; for one that is not drawn only its radius is written.
 
-    Comparisons let pass what is drawn, and none holds for NaN: what is drawn is finite.
+    A Gaussian is drawn only if every comparison holds. None holds for NaN, so all that is drawn is finite.
     """
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     exists = g < n
@@ -156,12 +156,12 @@ def project_forward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
     """Do what `gsplat_compat.project` does, without gradients; all tensors are contiguous float32.
 
-    What gsplat would draw with values that are not finite has radius zero here, as in the torch backend: what is wider
-    than some billions of px, and in gsplat 1.5's layout what has an opacity of NaN.
+    gsplat also draws some Gaussians with values that are not finite: those wider than some billions of px and, in the
+    layout of gsplat 1.5, those with an opacity of NaN. Here, as in the torch backend, their radius is 0.
 
     Returns:
         radii, means2d, depths and conics as `render.types.Projected` has them, with radii as the installed gsplat has
-        them. Only radii are written of what is not drawn.
+        them. For a Gaussian that is not drawn only its radius is written.
     """
     shape = len(viewmats), len(means)
     if gsplat_compat.RADII_PER_AXIS:

@@ -51,7 +51,7 @@ else:  # Triton's interpreter, which knows no PTX
 
 @triton.jit
 def load_viewmat(viewmats, view):
-    """Return the upper three rows of a view's matrix, row by row: of each the rotation's entries, then the shift."""
+    """Return the upper three rows of a view's matrix. Each has three entries of the rotation, then the shift."""
     at = viewmats + 16 * view
     return (
         tl.load(at), tl.load(at + 1), tl.load(at + 2), tl.load(at + 3),
@@ -88,16 +88,16 @@ def unit_quaternion(quats, at, exists):
 
 @triton.jit
 def clamped(ratio, focal, centre, size):
-    """Clamp x / z where the Jacobian is taken: 0.3 half images beyond the image's border."""
+    """Clamp a slope x / z or y / z, for the Jacobian, to those at most 0.3 half images beyond the image's border."""
     margin = 0.15 * size / focal
     return tl.minimum(tl.maximum(ratio, -(centre / focal + margin)), (size - centre) / focal + margin)
 
 
 @triton.jit
 def projection_rows(slope_x, slope_y, jx, jy, w00, w01, w02, w10, w11, w12, w20, w21, w22):
-    """Return the entries of J W, row by row, of a camera's rotation W and the Jacobian J [2, 3] of the projection.
+    """Return the entries of J W, row by row: W is a camera's rotation, and J [2, 3] the Jacobian of the projection.
 
-    J has jx and jy, the focal lengths over the depth, and the slopes x / z and y / z where it is taken.
+    `jx` and `jy` are the focal lengths over the depth. The slopes are x / z and y / z of the point at which J is taken.
     """
     return (
         jx * (w00 - slope_x * w20), jx * (w01 - slope_x * w21), jx * (w02 - slope_x * w22),

@@ -10,6 +10,8 @@ from sadgs_ns.kernels import cdiv
 from sadgs_ns.kernels.shared import drawn, load3, load_intrinsics, rotation, store3
 
 _LANES = 128  # Gaussians that one program handles
+_EPSILON32 = tl.constexpr(1.1920928955078125e-07)  # The distance from 1 to the next float32
+_TINY64 = tl.constexpr(2.2250738585072014e-308)  # The smallest normal float64
 
 
 @triton.jit
@@ -64,6 +66,7 @@ def _observe(
     HIGHEST: tl.constexpr, OCTAVES: tl.constexpr, INVALID: tl.constexpr, PER_GAUSSIAN: tl.constexpr,
     LANES: tl.constexpr,
 ):  # fmt: skip
+    """Write η of the three axes of LANES Gaussians in each view; NaN where it is not observed. [C, N, 3]"""
     g = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     candidate = g < n
     x, y, z = load3(means, 3 * g, candidate)
@@ -86,13 +89,14 @@ def _observe(
         determinant = a * c - b * b
         # Triton's maximum drops NaN on a GPU, so comparisons find what is not finite: here, in S̄ and in η.
         seen = seen & (tl.abs(determinant) < float("inf"))
-        inverse = 1 / tl.maximum(tl.maximum(determinant, 1.1920928955078125e-07 * a * c), 2.2250738585072014e-308)
-        xx = tl.maximum(c * inverse - BLUR, 0.0)
-        yy = tl.sqrt(tl.maximum(a * inverse - BLUR, 0.0))
-        factor_xx = tl.sqrt(xx)
-        factor_xy = tl.where(xx > 0, -b * inverse / tl.where(xx > 0, factor_xx, 1.0), 0.0)
-        factor_xy = tl.maximum(tl.minimum(factor_xy, yy), -yy)
-        factor_yy = tl.sqrt(tl.maximum(yy * yy - factor_xy * factor_xy, 0.0))
+        least = a * _EPSILON32 * c  # A float32 conic tells its determinant from 0 only above this.
+        inverse = 1 / tl.maximum(tl.maximum(determinant, least), _TINY64)
+        variance_x = tl.maximum(c * inverse - BLUR, 0.0)
+        deviation_y = tl.sqrt(tl.maximum(a * inverse - BLUR, 0.0))
+        factor_xx = tl.sqrt(variance_x)
+        factor_xy = tl.where(variance_x > 0, -b * inverse / tl.where(variance_x > 0, factor_xx, 1.0), 0.0)
+        factor_xy = tl.maximum(tl.minimum(factor_xy, deviation_y), -deviation_y)
+        factor_yy = tl.sqrt(tl.maximum(deviation_y * deviation_y - factor_xy * factor_xy, 0.0))
         radius = 2 * tl.sqrt(tl.load(jitter + 2 * at, seen, 0.0))
         angle = 6.283185307179586 * tl.load(jitter + 2 * at + 1, seen, 0.0)
         u = radius * tl.cos(angle)

@@ -21,21 +21,22 @@ _PIXELS = 1024  # Pixels that a program handles where no neighbours matter
 def _correlate(
     image, kernel, result, height, width, taps, VERTICAL: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr
 ):
+    """Correlate ROWS × COLUMNS pixels of one channel with a kernel along columns (VERTICAL) or rows; outside is 0."""
     row = tl.program_id(1) * ROWS + tl.arange(0, ROWS)[:, None]
     column = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)[None, :]
     inside = (row < height) & (column < width)
-    start = tl.program_id(2).to(tl.int64) * height * width
+    plane = tl.program_id(2).to(tl.int64) * height * width
     total = tl.zeros([ROWS, COLUMNS], tl.float32)
     for k in range(taps):
-        step = k - taps // 2
+        shift = k - taps // 2
         if VERTICAL:
-            there = inside & (row + step >= 0) & (row + step < height)
-            value = tl.load(image + start + (row + step) * width + column, there, 0.0)
+            exists = inside & (row + shift >= 0) & (row + shift < height)
+            value = tl.load(image + plane + (row + shift) * width + column, exists, 0.0)
         else:
-            there = inside & (column + step >= 0) & (column + step < width)
-            value = tl.load(image + start + row * width + column + step, there, 0.0)
+            exists = inside & (column + shift >= 0) & (column + shift < width)
+            value = tl.load(image + plane + row * width + column + shift, exists, 0.0)
         total += tl.load(kernel + k) * value
-    tl.store(result + start + row * width + column, total, inside)
+    tl.store(result + plane + row * width + column, total, inside)
 
 
 @triton.jit(do_not_specialize=["n", "channels", "weight_stride"])

@@ -29,6 +29,8 @@ _PART_ROWS = 4  # Rows of tiles of a part that a program writes at once
 _PART_COLUMNS = 8  # Columns of tiles of a part that a program writes at once
 _PROGRAMS = 4096  # Most programs that share out the parts: as many as an H100 runs at once, of one warp each
 _PLACE = tl.constexpr(2**24)  # Factor on a Gaussian's place by depth, noted with the number of one of its parts
+_SKIPPED_ROWS = tl.constexpr(32)  # Rows of tiles before a part that are counted at once
+_MIDDLE_TILE = tl.constexpr(2**15)  # Tiles are numbered from minus this: 16 bits then tell 65,536 of them apart.
 _ORDER_LANES = 512  # Pairs or tiles that one program handles where the lists are put in order
 
 
@@ -149,22 +151,21 @@ def _list(
     fits = needed <= num_pairs
     tl.store(overflowed, 1, needed > num_pairs)
     g = tl.load(order + lane, exists, 0).to(tl.int32)
-    at = tl.load(ends + lane - 1, exists & (lane > 0), 0)
-    pairs = tl.load(ends + lane, exists & fits, 0) - at
-    cut = tl.where(pairs > FEW, (pairs + PART - 1) // PART, 0).to(tl.int32)
-    total = tl.sum(cut)
+    place = tl.load(ends + lane - 1, exists & (lane > 0), 0)
+    pairs = tl.load(ends + lane, exists & fits, 0) - place
+    num_parts = tl.where(pairs > FEW, (pairs + PART - 1) // PART, 0).to(tl.int32)
+    total = tl.sum(num_parts)
     if total > 0:
-        noted = tl.atomic_add(part_count, total) + tl.cumsum(cut, 0) - cut
-        for i in range(tl.max(cut)):
-            tl.store(parts + noted + i, lane.to(tl.int64) * _PLACE + i, i < cut)
+        first_part = tl.atomic_add(part_count, total) + tl.cumsum(num_parts, 0) - num_parts
+        for i in range(tl.max(num_parts)):
+            tl.store(parts + first_part + i, lane.to(tl.int64) * _PLACE + i, i < num_parts)
     ellipse, first_row, last_row = _load_ellipse(
         means2d, radii, conics, opacities, g, exists, tile_width, tile_height, PER_GAUSSIAN, TILE
     )
     for i in tl.static_range(PER_GAUSSIAN):
         tl.store(radii + PER_GAUSSIAN * g + i, 0, exists & (needed > num_pairs))
-    last_row = tl.where(fits & (cut == 0), last_row, first_row)
+    last_row = tl.where(fits & (num_parts == 0), last_row, first_row)
     row_of_view = g // num_gaussians * rows_per_view
-    place = at
     for i in range(tl.max(last_row - first_row)):
         row = first_row + i
         first, last = _columns_of_row(row, ellipse, TILE)
@@ -172,14 +173,15 @@ def _list(
         for j in range(tl.max(last - first)):
             listed = first + j < last
             tile = (row_of_view + row) * tile_width + first + j
-            tl.store(tiles + place, (tile - 32768).to(tiles.dtype.element_ty), listed)
+            tl.store(tiles + place, (tile - _MIDDLE_TILE).to(tiles.dtype.element_ty), listed)
             tl.store(ids + place, g, listed)
             place += listed.to(place.dtype)
     stride = tl.num_programs(0) * LANES
     used = tl.where(fits, needed, 0)
     for i in range(tl.cdiv(num_pairs - used, stride)):
         unused = used + i * stride + lane
-        tl.store(tiles + unused, (num_tiles - 32769 + lane * 0).to(tiles.dtype.element_ty), unused < num_pairs)
+        last_tile = num_tiles - 1 - _MIDDLE_TILE + lane * 0
+        tl.store(tiles + unused, last_tile.to(tiles.dtype.element_ty), unused < num_pairs)
         tl.store(ids + unused, lane * 0, unused < num_pairs)
 
 
@@ -190,44 +192,45 @@ def _list_parts(
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr, PART: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
     """Write the pairs of the parts that `_list` noted. A part is a share of the rows of a Gaussian's tiles."""
-    index = tl.arange(0, ROWS)
-    column = tl.arange(0, COLUMNS)[None, :]
-    every = tl.arange(0, 32)
-    end = tl.load(part_count)
-    which = tl.program_id(0)
-    while which < end:
-        part = tl.load(parts + which)
-        position = part // _PLACE
+    row_offset = tl.arange(0, ROWS)
+    column_offset = tl.arange(0, COLUMNS)[None, :]
+    skipped_offset = tl.arange(0, _SKIPPED_ROWS)
+    num_noted = tl.load(part_count)
+    index = tl.program_id(0)
+    while index < num_noted:
+        noted = tl.load(parts + index)
+        position = noted // _PLACE
+        part = noted % _PLACE
         g = tl.load(order + position).to(tl.int32)
         place = tl.load(ends + position - 1, position > 0, 0)
-        cut = (tl.load(ends + position) - place + PART - 1) // PART
+        num_parts = (tl.load(ends + position) - place + PART - 1) // PART
         ellipse, first_row, last_row = _load_ellipse(
             means2d, radii, conics, opacities, g, True, tile_width, tile_height, PER_GAUSSIAN, TILE
         )
-        number = part % _PLACE
-        rows = last_row - first_row
-        begin = first_row + (rows * number // cut).to(tl.int32)
-        last_row = first_row + (rows * (number + 1) // cut).to(tl.int32)
-        while first_row < begin:  # Parts before this one take the places before this one's.
-            row = first_row + every
+        num_rows = last_row - first_row
+        part_row = first_row + (num_rows * part // num_parts).to(tl.int32)
+        last_row = first_row + (num_rows * (part + 1) // num_parts).to(tl.int32)
+        while first_row < part_row:  # Parts before this one take the places before this one's.
+            row = first_row + skipped_offset
             first, last = _columns_of_row(row, ellipse, TILE)
-            place += tl.sum(tl.where(row < begin, tl.maximum(last - first, 0), 0))
-            first_row += 32
-        above = g // num_gaussians * rows_per_view
-        while begin < last_row:
-            row = begin + index
+            place += tl.sum(tl.where(row < part_row, tl.maximum(last - first, 0), 0))
+            first_row += _SKIPPED_ROWS
+        row_of_view = g // num_gaussians * rows_per_view
+        while part_row < last_row:
+            row = part_row + row_offset
             first, last = _columns_of_row(row, ellipse, TILE)
             count = tl.where(row < last_row, tl.maximum(last - first, 0), 0)
-            places = place + tl.cumsum(count, 0) - count
-            numbers = (above + row) * tile_width + first - 32768
+            first_place = place + tl.cumsum(count, 0) - count
+            first_tile = (row_of_view + row) * tile_width + first - _MIDDLE_TILE
             for j in range(0, tl.max(count), COLUMNS):
-                listed = j + column < count[:, None]
-                at = places[:, None] + j + column
-                tl.store(tiles + at, (numbers[:, None] + j + column).to(tiles.dtype.element_ty), listed)
-                tl.store(ids + at, g + column * 0 + index[:, None] * 0, listed)
+                listed = j + column_offset < count[:, None]
+                at = first_place[:, None] + j + column_offset
+                tile = first_tile[:, None] + j + column_offset
+                tl.store(tiles + at, tile.to(tiles.dtype.element_ty), listed)
+                tl.store(ids + at, g + column_offset * 0 + row_offset[:, None] * 0, listed)
             place += tl.sum(count)
-            begin += ROWS
-        which += tl.num_programs(0)
+            part_row += ROWS
+        index += tl.num_programs(0)
 
 
 @triton.jit(do_not_specialize=["num_pairs", "num_tiles", "of_pairs", "halvings"])
@@ -249,7 +252,7 @@ def _order(tiles, by_tile, ids, ordered, starts, num_pairs, num_tiles, of_pairs,
         for _ in range(halvings):
             middle = (low + high) // 2
             searching = low < high
-            before = tl.load(tiles + middle, searching, 0).to(tl.int32) < tile - 32768
+            before = tl.load(tiles + middle, searching, 0).to(tl.int32) < tile - _MIDDLE_TILE
             low = tl.where(searching & before, middle + 1, low)
             high = tl.where(searching & ~before, middle, high)
         tl.store(starts + tile, low.to(tl.int32), tile < num_tiles)
@@ -265,7 +268,7 @@ class PairCounts:
 
     @staticmethod
     def sent(counts: Tensor) -> PairCounts:
-        """Start to copy numbers, int64 [C], from any device to the host; they may change after this call."""
+        """Start to copy counts, int64 [C], from any device to the host; they may be overwritten after this call."""
         if counts.device.type != "cuda":
             return PairCounts(counts.clone(), None)
         on_host = torch.empty(counts.shape, dtype=torch.int64, pin_memory=True).copy_(counts, non_blocking=True)
@@ -314,13 +317,19 @@ class PendingTiles:
         gradient flows and no statistic counts the views. Raises InputError if 32 bits do not number the pairs.
         """
         views, rows, columns = self.tile_counts
-        num_pairs = sum(self.pair_counts.wait()) if capacity is None else capacity
-        rows_per_view = rows if capacity is None else rows + 1
+        if capacity is None:
+            num_pairs = sum(self.pair_counts.wait())
+            rows_per_view = rows
+        else:
+            num_pairs = capacity
+            rows_per_view = rows + 1
         check_pairs(num_pairs)
         num_tiles = views * rows_per_view * columns
         device = self.ends.device
-        # Tiles are numbered from −2^15, so that 16 bits tell 65,536 of them apart.
-        tiles = torch.empty(num_pairs, dtype=torch.int16 if num_tiles <= 2**16 else torch.int32, device=device)
+        tile_type = torch.int32
+        if num_tiles <= 2 * _MIDDLE_TILE.value:
+            tile_type = torch.int16
+        tiles = torch.empty(num_pairs, dtype=tile_type, device=device)
         ids = torch.empty(num_pairs, dtype=torch.int32, device=device)
         n = len(self.order)
         per_gaussian = self.ellipses[1].dim() - 1
@@ -377,7 +386,12 @@ def intersect_tiles(
     # bytes of one sort of the pairs by both in 64 bits. Both sorts are stable, as gsplat's is.
     order = depths.flatten().argsort(stable=True)
     ends = counts[order].cumsum(0)
-    per_view = ends[-1:] if num_views == 1 else counts.view(num_views, -1).sum(1)
-    capturing = device.type == "cuda" and torch.cuda.is_current_stream_capturing()
-    pair_counts = PairCounts(per_view, None) if capturing else PairCounts.sent(per_view)
+    if num_views == 1:
+        per_view = ends[-1:]
+    else:
+        per_view = counts.view(num_views, -1).sum(1)
+    if device.type == "cuda" and torch.cuda.is_current_stream_capturing():
+        pair_counts = PairCounts(per_view, None)
+    else:
+        pair_counts = PairCounts.sent(per_view)
     return PendingTiles(ellipses, order, ends, pair_counts, tile_size, (num_views, tile_height, tile_width))

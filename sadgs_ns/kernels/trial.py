@@ -25,11 +25,11 @@ def run_trial(device: torch.device) -> None:
 
 
 def hash_kernels() -> None:
-    """Have Triton hash all kernels in one order, before the first is launched, so that another process finds them.
+    """Have Triton hash all kernels in a fixed order, before the first launch, so that processes share Triton's cache.
 
     In Triton 3.6 a kernel's hash, its key in the cache, depends on whether the functions it calls were hashed before.
     """
     for path in sorted(Path(__file__).parent.glob("[!_]*.py")):
         for value in vars(import_module(f"sadgs_ns.kernels.{path.stem}")).values():
             if isinstance(value, triton.JITFunction):
-                _ = value.cache_key
+                _ = value.cache_key  # Reading this property computes the hash.

@@ -85,7 +85,8 @@ class Rule:
 def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Split the axes on which η violated consistently (paper, section 3.5).
 
-    An axis needs about √η children. Those come first whose axes need most for each Gaussian that the split adds.
+    An axis needs about √η children. A Gaussian's priority is the sum of these numbers over the axes that are split,
+    divided by the number of Gaussians that the split adds.
     """
     violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)  # [N, 3]
     is_opaque = opacities(params) >= options.split_min_opacity  # [N]

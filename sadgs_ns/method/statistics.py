@@ -91,9 +91,9 @@ def observe(
     `info` is gsplat's meta, unpacked, of C views of one size, plus `structure_tensors` [C, H, W, 3] (S̄, which may be
     quantized), `viewmats` [C, 4, 4] and `Ks` [C, 3, 3].
     """
-    of_views = observed_eta(params, info, jitter)
+    eta_in_views = observed_eta(params, info, jitter)  # [C, N, 3]
     for name, statistic in STATISTICS.items():
-        statistic.update(statistics[name], of_views)
+        statistic.update(statistics[name], eta_in_views)
 
 
 def observed_eta(

@@ -224,7 +224,7 @@ class _Composite(torch.autograd.Function):
         grads = means2d.new_zeros(opacities.numel(), sum(sizes))  # [C * N, 6 + D (+ 2)]
         for (chunk, length), starts in zip(_chunks(tiles), ctx.starts, strict=True):
             v_colors, v_alphas = v_canvas[chunk].split([D, 1], dim=-1)  # [B, S * S, D], [B, S * S, 1]
-            # This is what lies behind a Gaussian, dotted with v_colors: behind the last, minus what is left to cover.
+            # The colour behind a Gaussian, dotted with v_colors. Alpha is a channel with a background of −1.
             behind = (canvas[chunk][..., -1:] - 1.0) * v_alphas  # [B, S * S, 1]
             for index in reversed(range(len(starts))):
                 begin = index * _SEGMENT
@@ -286,33 +286,40 @@ def _segment_gradients(
     segment: _Segment,
     colors: Tensor,  # [B, L, D]
     v_colors: Tensor,  # [B, S * S, D]
-    behind: Tensor,  # [B, S * S, 1] what is behind the segment, dotted with v_colors
+    behind: Tensor,  # [B, S * S, 1] the colour behind the segment, dotted with v_colors
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and the new `behind`."""
+    """Return gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and a new `behind`.
+
+    The new `behind` is for the segment before this one: it includes this segment.
+    """
     dx = segment.dx
     dy = segment.dy
     alphas = segment.alphas
     weights = segment.weights
     a, b, c = segment.conics
     dots = v_colors @ colors.mT  # [B, S * S, L]
-    shares = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)
-    shares = shares.flip(-1).cumsum(dim=-1).flip(-1)  # [B, S * S, L + 1] from each Gaussian backwards
-    hidden = shares[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
-    v_alphas = (dots.view_as(alphas) * segment.transmittances[..., :-1]).sub_(hidden)
+    # What each Gaussian adds to the pixel, and last what is behind the segment, dotted with v_colors.
+    added = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)  # [B, S * S, L + 1]
+    from_behind = added.flip(-1).cumsum(dim=-1).flip(-1)  # Sums of an entry and all behind it. [B, S * S, L + 1]
+    hidden = from_behind[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
+    v_alphas = dots.view_as(alphas) * segment.transmittances[..., :-1]
+    v_alphas.sub_(hidden)
+    v_sigmas = v_alphas.mul_(alphas).neg_()
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
-    v_sigmas = v_alphas.mul_(alphas).neg_().masked_fill_((weights == 0) | (alphas >= _MAX_ALPHA), 0.0)
+    has_no_gradient = (weights == 0) | (alphas >= _MAX_ALPHA)
+    v_sigmas.masked_fill_(has_no_gradient, 0.0)
     # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
-    columns = v_sigmas.sum(dim=1, keepdim=True)  # [B, 1, S, L]
-    rows = v_sigmas.sum(dim=2, keepdim=True)  # [B, S, 1, L]
-    mixed = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
+    column_sums = v_sigmas.sum(dim=1, keepdim=True)  # [B, 1, S, L]
+    row_sums = v_sigmas.sum(dim=2, keepdim=True)  # [B, S, 1, L]
+    row_sums_x = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]
     # [B, L]
-    total = rows.sum(dim=(1, 2))
-    mx = (columns * dx).sum(dim=(1, 2))
-    my = (rows * dy).sum(dim=(1, 2))
-    mxx = (columns * dx * dx).sum(dim=(1, 2))
-    mxy = (mixed * dy).sum(dim=(1, 2))
-    myy = (rows * dy * dy).sum(dim=(1, 2))
+    total = row_sums.sum(dim=(1, 2))
+    mx = (column_sums * dx).sum(dim=(1, 2))
+    my = (row_sums * dy).sum(dim=(1, 2))
+    mxx = (column_sums * dx * dx).sum(dim=(1, 2))
+    mxy = (row_sums_x * dy).sum(dim=(1, 2))
+    myy = (row_sums * dy * dy).sum(dim=(1, 2))
     a0 = a[:, 0, 0]
     b0 = b[:, 0, 0]
     c0 = c[:, 0, 0]
@@ -326,6 +333,8 @@ def _segment_gradients(
         # [B, S, S, L]
         slopes_x = a * dx + b * dy
         slopes_y = b * dx + c * dy
-        sums = [slopes.mul_(v_sigmas).abs_().sum(dim=(1, 2)) for slopes in (slopes_x, slopes_y)]
-        parts.append(torch.stack(sums, dim=-1))
-    return torch.cat(parts, dim=-1).flatten(0, 1), shares[..., :1]
+        absolute_x = slopes_x.mul_(v_sigmas).abs_()
+        absolute_y = slopes_y.mul_(v_sigmas).abs_()
+        absolute = [absolute_x.sum(dim=(1, 2)), absolute_y.sum(dim=(1, 2))]
+        parts.append(torch.stack(absolute, dim=-1))
+    return torch.cat(parts, dim=-1).flatten(0, 1), from_behind[..., :1]

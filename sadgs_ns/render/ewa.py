@@ -62,7 +62,7 @@ def view_directions(
 ) -> Tensor:
     """Return the vectors from cameras to positions. [C, N, 3]
 
-    They need no inverse of a matrix, for which the host would wait for the device.
+    The cameras' positions are computed without the inverse of a matrix, for which the host would wait for the device.
     """
     positions = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:]).mT  # [C, 1, 3]
     return means - positions

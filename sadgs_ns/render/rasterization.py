@@ -28,14 +28,15 @@ def project(
     """Project Gaussians into cameras and compute their colours, differentiably.
 
     Args:
-        gaussians: They are float32, or float64 for the torch backend.
+        gaussians: In float32, or for the torch backend in float64, too.
         cameras: On the same device. With the Triton backend `Ks` gets no gradient.
         options: The same as for `composite`.
-        begin_tiles: Whether the result is composited as it is. The Triton backend then begins its tile lists here, so
-            that the host waits for their length while the device computes colours.
+        begin_tiles: Whether `composite` will get this result unchanged. The Triton backend then begins its tile lists
+            here, so that the host waits for their length while the device computes colours.
 
     Raises:
-        InputError: If `options.backend` cannot draw on this device, or so many Gaussians or pixels (kernels/limits.py).
+        InputError: If `options.backend` does not draw on this device, or there are more Gaussians or pixels than the
+            Triton kernels can address (kernels/limits.py).
     """
     return _backend(options.backend, gaussians.means.device).project(gaussians, cameras, options, begin_tiles)
 

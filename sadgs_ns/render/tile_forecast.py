@@ -26,11 +26,22 @@ class Counts(Protocol):
 
 
 class _Visit(NamedTuple):
+    """A view was rendered."""
+
     epoch: int
     num_pairs: int
 
 
+class _Change(NamedTuple):
+    """By how much a view's number of pairs changed from one visit to the next."""
+
+    epoch: int  # Of the earlier visit
+    factor: float
+
+
 class _Call(NamedTuple):
+    """Views were rendered together; their numbers of pairs are on their way to the host."""
+
     views: Sequence[int]
     size: tuple[int, int]
     epoch: int
@@ -48,12 +59,11 @@ class TileForecast:
     """
 
     def __init__(self) -> None:
-        # Epochs end where the number of Gaussians changes.
-        self._epoch = 0
+        self._epoch = 0  # An epoch ends when the number of Gaussians changes.
         self._num_gaussians = -1
-        self._visits: dict[tuple[int, tuple[int, int]], _Visit] = {}
-        self._changes: deque[tuple[int, float]] = deque(maxlen=RECENT)  # epoch of the visit before, and the factor
-        self._calls: deque[_Call] = deque()
+        self._visits: dict[tuple[int, tuple[int, int]], _Visit] = {}  # The last one, by the view and its size
+        self._changes: deque[_Change] = deque(maxlen=RECENT)  # Those whose later visit is of this epoch
+        self._calls: deque[_Call] = deque()  # Those whose numbers were not used yet, the oldest first
         self.round_to_powers = False
 
     def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
@@ -72,10 +82,10 @@ class TileForecast:
             visit = self._visits.get((view, size))
             if visit is None:
                 return None
-            changes = [change for before, change in self._changes if before <= visit.epoch]
-            if visit.epoch < self._epoch and not changes:
+            factors = [change.factor for change in self._changes if change.epoch <= visit.epoch]
+            if visit.epoch < self._epoch and not factors:
                 return None
-            total += max([1.0, *changes]) * visit.num_pairs
+            total += max([1.0, *factors]) * visit.num_pairs
         rounded = self._round_up(int(MARGIN * total) + 1)
         if rounded > MOST_PAIRS:
             return None
@@ -105,7 +115,7 @@ class TileForecast:
                 self._visits[view, call.size] = _Visit(call.epoch, num_pairs)
                 if before is not None and call.epoch == self._epoch:
                     factor = (num_pairs + _SMALL) / (before.num_pairs + _SMALL)
-                    self._changes.append((before.epoch, factor))
+                    self._changes.append(_Change(before.epoch, factor))
             if call.capacity is not None and sum(counts) > call.capacity:
                 lost += call.views
         return lost

@@ -31,6 +31,7 @@ from helpers.small_scenes import HEIGHT, VIEWS, WIDTH
 from sadgs_ns.data import colmap
 from sadgs_ns.data.checks import check_data
 from sadgs_ns.data.checks.capture import check_capture
+from sadgs_ns.data.layouts import find_reconstructions
 from sadgs_ns.data.own_parsers import ColmapParser
 from sadgs_ns.data.parsers import AutomaticDataParserConfig, choose_parser
 from sadgs_ns.errors import InputError
@@ -244,7 +245,7 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
     (data / "photo.png").write_bytes((data / "images/000.png").read_bytes())
     (data / "other").mkdir()
     (data / "a clip.MP4").touch()
-    makes = f"`sadgs-process '{data}/a clip.MP4' FOLDER` makes one of it, and `sadgs` a splat."
+    makes = f"`sadgs-process '{data}/a clip.MP4' FOLDER` makes a capture of it, and `sadgs` makes a splat."
     for folder, sentence in (
         (data / "images", f"{data}/images is a part of the capture {data}: give --data that folder."),
         (data / SPARSE_FOLDER, f"{data}/sparse/0 is a part of the capture {data}: give --data that folder."),
@@ -259,6 +260,23 @@ def test_a_folder_above_or_below_a_capture_is_told_where_that_is(scene: Path, tm
         assert str(refused.value) == sentence
     (finding,) = check_data(data / "other")
     assert "other holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
+
+
+def test_a_broken_reconstruction_in_another_folder_does_not_hide_the_capture(scene: Path, tmp_path: Path):
+    data = tmp_path / "above/capture"
+    shutil.copytree(scene, data)
+    broken = data.parent / "broken"
+    broken.mkdir()
+    shutil.copy(scene / SPARSE_FOLDER / "cameras.bin", broken)
+    (broken / "images.bin").write_bytes(b"\1")
+    with refusal(r"broken/images\.bin is cut off or corrupt"):
+        find_reconstructions(broken)
+    (finding,) = check_data(data.parent)
+    assert finding.sentence == f"{data.parent} is no capture, but {data} in it is one: give --data that folder."
+    photos = broken / "images"
+    photos.mkdir()
+    (finding,) = check_data(photos)
+    assert "images holds neither transforms.json nor a COLMAP reconstruction" in finding.sentence
 
 
 @pytest.mark.hard_case("a folder that may not be entered, names too long", "refused: cannot be read")

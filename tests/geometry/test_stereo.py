@@ -186,7 +186,7 @@ def test_correlations_are_those_of_plain_loops(level: int):
     height, width = image.shape[1:]
     K = torch.diag(torch.tensor([0.5**level, 0.5**level, 1.0])).double() @ Ks[0]
     inverse = torch.linspace(0.97, 1.03, width) / trace("ridge", viewmats[0], K, height, width)[1]
-    fast = stereo._correlation(image, other, view.to[0], inverse[None].float())[0]
+    fast = stereo._correlation(image, other, view.to_neighbours[0], inverse[None].float())[0]
     compared = 0
     for y, x in [(int(height * v), int(width * u)) for v in (0.2, 0.5, 0.8) for u in (0, 0.3, 0.5, 0.7, 0.99)]:
         pairs = []

@@ -57,15 +57,16 @@ def check_capture(config: FullImageDatamanagerConfig, open_images: bool = True) 
 
 
 def _parse_on_trial(config: DataParserConfig, data: Path) -> list[Finding]:
-    """Let a parser whose data has no check read it, and return the findings; raise InputError if it cannot.
+    """Parse data for which there is no check, and return the findings; raise InputError if the parser fails.
 
-    These parsers raise anything where a folder is not of their kind.
+    These parsers raise errors of any class if the folder has another layout than theirs.
     """
     parser = copy.copy(config)
     parser.data = data
     parser._target = OWN.get(parser._target, parser._target)
-    kind = type(config)
-    name = next((name for name, other in all_dataparsers.items() if type(other) is kind), kind.__name__)
+    config_class = type(config)
+    names = [name for name, other in all_dataparsers.items() if type(other) is config_class]
+    name = next(iter(names), config_class.__name__)
     remedy = (
         "give --data the folder that this parser is for, or leave the parser out for transforms.json, COLMAP and "
         "Blender data"

@@ -95,8 +95,8 @@ def _frames(
 def _masks(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Return the masks of the images that have one, relative to the folder of masks.
 
-    A mask that is nearly called as an image without one counts as missing, as it may be meant. Raise InputError if no
-    image has a mask.
+    For an image without a mask, a file may have nearly the mask's name. Since it may be meant, the mask's own name is
+    then returned, so that the check of masks reports it as missing. Raise InputError if no image has a mask.
     """
     masks = {}
     for name in names:

@@ -17,7 +17,7 @@ from sadgs_ns.data.images import read_small
 from sadgs_ns.data.level import LARGEST_TILT, tilt
 from sadgs_ns.data.views import NO_COEFFICIENTS, Camera, View
 from sadgs_ns.errors import InputError
-from sadgs_ns.geometry.outliers import CAMERA_SHARE, FEWEST_PLACES, POINT_SHARE, REACH, far_outliers, span_space
+from sadgs_ns.geometry.outliers import CAMERA_SHARE, FEWEST_PLACES, POINT_SHARE, REACH, far_outliers, has_enough_places
 
 _FARTHEST = 2.0**23 / 1000  # Distance of a camera, in spreads of the others, which then have 1,000 float32 steps
 _WIDEST = 170.0  # Angle of view in degrees under which lenses without fisheye stay
@@ -168,7 +168,11 @@ def _half_sizes(camera: Camera) -> tuple[float, float]:
 
 
 def _can_be_undone(camera: Camera, radius: float) -> bool:
-    """Return whether each pixel up to a distorted radius, in focal lengths from the middle, shows one place alone."""
+    """Return whether distortion can be undone up to a distorted radius, in focal lengths from the principal point.
+
+    It can be undone if up to there the distorted radius rises with the undistorted one, so that no two directions share
+    a pixel, and if, except for a fisheye, their quotient at this radius is at most `_STRONGEST_DISTORTION`.
+    """
     largest = 4 * radius
     if camera.fisheye:
         largest = np.pi
@@ -176,15 +180,15 @@ def _can_be_undone(camera: Camera, radius: float) -> bool:
     with np.errstate(all="ignore"):  # Large coefficients overflow.
         factor = np.polyval([*reversed(camera.radial), 1.0], undistorted**2)
         distorted = undistorted * factor
-        falls = ~(np.diff(distorted) > 0)
-    end = len(falls)  # Up to here the distorted radius rises.
-    if falls.any():
-        end = int(falls.argmax())
-    if not distorted[end] >= radius:
+        rises = np.diff(distorted) > 0
+    end = len(rises)  # Up to here the distorted radius rises.
+    if not rises.all():
+        end = int(rises.argmin())
+    if not distorted[end] >= radius:  # It may be NaN.
         return False
     is_reached = distorted[: end + 1] >= radius
-    strength = factor[int(is_reached.argmax())]  # Where the distorted radius reaches the given one
-    return bool(camera.fisheye or strength <= _STRONGEST_DISTORTION)
+    first_reached = int(is_reached.argmax())
+    return bool(camera.fisheye or factor[first_reached] <= _STRONGEST_DISTORTION)
 
 
 def check_ply(path: Path, views: Sequence[View], remedy: str) -> Iterator[Finding]:
@@ -210,7 +214,7 @@ def check_points(points: colmap.Points, views: Sequence[View], path: Path, remed
         yield fault(f"{path} holds no SfM point: {remedy}.")
     else:
         yield note(f"{path} has {len(positions):,} points.")
-        if not span_space(positions):
+        if not has_enough_places(positions):
             problem = (
                 f"{path} has SfM points in fewer than {FEWEST_PLACES} places, which say too little about the scene"
             )
@@ -237,8 +241,8 @@ def _check_colors(points: colmap.Points, views: Sequence[View], path: Path, reme
 def _fit(positions: NDArray[np.float64], colors: NDArray[np.uint8], view: View) -> float | None:
     """Return the correlation of the colours of points [P, 3] with the image's where they are seen; None if unknown.
 
-    Only the nearer half counts, as the others may be hidden. Differences within each of 4 × 4 cells of the image are
-    compared, as the sky is up in a wrong photo, too.
+    Only the nearer half of the points counts, because the others may be hidden. The mean colours of each of 4 × 4 cells
+    of the image are subtracted, because the sky is at the top in a wrong photo, too.
     """
     camera = view.camera
     if camera.fisheye or view.image is None:
@@ -249,7 +253,7 @@ def _fit(positions: NDArray[np.float64], colors: NDArray[np.uint8], view: View) 
         pixels = np.stack([x * camera.fx, y * camera.fy], -1) * (bend / z)[:, None] + [camera.cx, camera.cy]
     places = pixels / [camera.width, camera.height]  # Shares of width and height. [P, 2]
     is_inside = (places >= 0).all(1) & (places < 1).all(1)
-    seen = (z > 0) & (bend > 2 / 3) & is_inside  # With less, lenses fold back.
+    seen = (z > 0) & (bend > 2 / 3) & is_inside  # Where `bend` is less, lenses fold the image back.
     if seen.sum() < 200:
         return None
     image = read_small(view.image)
@@ -295,26 +299,30 @@ def _check_distances(positions: NDArray[np.float64], views: Sequence[View], path
 
 
 def _share_of_views_with_points(positions: NDArray[np.float64], views: Sequence[View]) -> float:
-    """Return the share of the views that have any of the points [P, 3] on their image or not far beside it."""
+    """Return the share of the views that have any of the points [P, 3] on their image or within half an image of it."""
     positions = positions[:: len(positions) // 10_000 + 1]  # [P, 3]
     views = views[:: len(views) // 50 + 1]
-    seeing = 0
+    num_seeing = 0
     for view in views:
         x, y, z = view.rotation @ (positions - view.centre).T  # [P] each
         visible = z > 0
         if not view.camera.fisheye:
-            camera = view.camera  # A lens or a principal point moves what is seen by less than half an image.
-            visible &= np.abs(x * camera.fx + (camera.cx - camera.width / 2) * z) < camera.width * z
-            visible &= np.abs(y * camera.fy + (camera.cy - camera.height / 2) * z) < camera.height * z
-        seeing += bool(visible.any())
-    return seeing / len(views)
+            # Distortion is ignored, since it moves points by less than half an image.
+            camera = view.camera
+            from_middle_x = x * camera.fx + (camera.cx - camera.width / 2) * z  # In px, times the depth
+            from_middle_y = y * camera.fy + (camera.cy - camera.height / 2) * z
+            visible &= np.abs(from_middle_x) < camera.width * z
+            visible &= np.abs(from_middle_y) < camera.height * z
+        if visible.any():
+            num_seeing += 1
+    return num_seeing / len(views)
 
 
 def _spread(centres: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the median of centres [V, 3], their distances from it [V], and the one within which most lie, not all."""
+    """Return the median of centres [V, 3], their distances from it [V], and the distance within which most lie."""
     middle = np.median(centres, axis=0)
     distances = np.linalg.norm(centres - middle, axis=1)
     spread = float(np.quantile(distances, CAMERA_SHARE, method="lower"))
-    if not spread > 1e-9 * np.abs(middle).max():  # A tripod's is rounding.
+    if not spread > 1e-9 * np.abs(middle).max():  # On a tripod, rounding alone moves the centres.
         spread = 0.0
     return middle, distances, spread

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from sadgs_ns.data.images import SMALL_PHOTO, VIDEO_SUFFIXES, image_size, images
 from sadgs_ns.data.layouts import COLMAP_FOLDERS, find_reconstructions, layout_of
 from sadgs_ns.data.nearby import NearbyFiles
 from sadgs_ns.data.transforms import GIVE_POSES
+from sadgs_ns.errors import InputError
 
 _BUNDLER = (
     "kapture_import_bundler.py -i {file} -l LIST.txt -im {photos} --add-reconstruction -o KAPTURE && "
@@ -129,7 +131,7 @@ def _no_folder(data: Path) -> str:
         return f"{data} does not exist: give --data the folder of a capture."
     if data.suffix.lower() in VIDEO_SUFFIXES:
         command = f"sadgs-process {shlex.quote(str(data))} FOLDER"
-        return f"{data} is a video and no capture: `{command}` makes one of it, and `sadgs` a splat."
+        return f"{data} is a video and no capture: `{command}` makes a capture of it, and `sadgs` makes a splat."
     return f"{data} is a file: give --data the folder of a capture."
 
 
@@ -138,7 +140,7 @@ def _capture_around(folder: Path) -> Path | None:
     for parent in folder.parents[:3]:
         part = folder.relative_to(parent).parts[0]
         is_known = part.startswith("images") or part in ("masks", "sparse", "colmap")
-        if is_known and layout_of(parent) is not None:
+        if is_known and _is_capture(parent):
             return parent
     return None
 
@@ -146,6 +148,13 @@ def _capture_around(folder: Path) -> Path | None:
 def _capture_inside(data: Path) -> Path | None:
     """Return the first capture among the folders in a folder; None if there is none."""
     for folder in sorted(data.iterdir())[:100]:
-        if folder.is_dir() and layout_of(folder) is not None:
+        if folder.is_dir() and _is_capture(folder):
             return folder
     return None
+
+
+def _is_capture(folder: Path) -> bool:
+    """Return whether a folder has the layout of a capture. One that cannot be read is none to point to."""
+    with contextlib.suppress(InputError):
+        return layout_of(folder) is not None
+    return False

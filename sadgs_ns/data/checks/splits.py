@@ -20,30 +20,32 @@ _SHELL = set('"$`\\')  # A shell acts on them in double quotes, between which ne
 
 
 def check_splits(
-    names: Sequence[str], lists: Mapping[str, Any], called: Callable[[str], str], locate: Callable[[str], Path],
+    names: Sequence[str], lists: Mapping[str, Any], subject: Callable[[str], str], locate: Callable[[str], Path],
     options: ParserOptions,
 ) -> Generator[Finding, None, int]:  # fmt: skip
     """Check how the images with poses are divided, and return how many are trained on.
 
-    Raise InputError if "train" or "val" lacks a list beside others, a list names an unknown image or a name has none.
-
     Args:
         names: The names of all images that have poses.
-        lists: The list of each split that has one; if any has, nerfstudio divides the images by nothing else.
-        called: Returns the start of a sentence about a split's list.
+        lists: The list of each split that has one. If there are any, nerfstudio divides the images by these alone.
+        subject: Returns the subject of a sentence about a split's list.
         locate: Returns the file that a name stands for.
         options: How the images are divided without lists.
+
+    Raises:
+        InputError: If there are lists but none of "train" or none of "val", if a list is no list of names or names an
+            unknown image, or if `eval_mode` is "filename" and a file's name has neither "train" nor "eval".
     """
     if not lists:
         return _count_training_images(names, options)
     images = set(map(locate, names))
     for split in ("train", "val"):
         if split not in lists:
-            raise InputError(f"{called(split)} is missing beside other lists of images: add it, or remove the others.")
+            raise InputError(f"{subject(split)} is missing beside other lists of images: add it, or remove the others.")
     located: dict[str, set[Path]] = {}
     for split, listed in lists.items():
         if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
-            raise InputError(f"{called(split)} is no list of images' names: correct it, or remove all such lists.")
+            raise InputError(f"{subject(split)} is no list of images' names: correct it, or remove all such lists.")
         unknown = [name for name in listed if locate(name) not in images]
         if unknown:
             which = and_more(repr(unknown[0]), len(unknown))
@@ -51,26 +53,28 @@ def check_splits(
             similar = similar_name(unknown[0], names)
             if similar is not None:
                 remedy = f"{similar!r} may be meant; {remedy}"
-            raise InputError(f"{called(split)} names {which}, which is no image with a pose: {remedy}.")
+            raise InputError(f"{subject(split)} names {which}, which is no image with a pose: {remedy}.")
         located[split] = set(map(locate, listed))
     training = located["train"]
     tests = located.get("test", set())
     in_both = training & tests
     if "test" not in located:
-        yield warning(f"{called('test')} is missing: `ns-eval` will have nothing to measure; name some images.")
+        yield warning(f"{subject('test')} is missing: `ns-eval` will have nothing to measure; name some images.")
     elif not tests and located["val"]:
-        yield warning(f"{called('test')} is empty: `ns-eval` will have nothing to measure; name some images.")
+        yield warning(f"{subject('test')} is empty: `ns-eval` will have nothing to measure; name some images.")
     elif in_both:
-        problem = f"{called('test')} names {len(in_both)} of the {len(training)} training images"
+        problem = f"{subject('test')} names {len(in_both)} of the {len(training)} training images"
         yield warning(f"{problem}: what `ns-eval` measures of them shows nothing about new views.")
     return len(training)
 
 
 def _count_training_images(names: Sequence[str], options: ParserOptions) -> int:
+    """Return how many images are trained on if there are no lists; raise InputError for a name without a split."""
     if options.eval_mode == "fraction":
         return math.ceil(len(names) * options.train_split_fraction)
     if options.eval_mode == "interval":
-        return int(np.count_nonzero(np.arange(len(names)) % options.eval_interval))
+        is_held_out = np.arange(len(names)) % options.eval_interval == 0
+        return len(names) - int(np.count_nonzero(is_held_out))
     if options.eval_mode != "filename":
         return len(names)
     files = [PurePosixPath(name).name for name in names]
