@@ -49,7 +49,7 @@ Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 
 
 def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
-    """What a process that has ended measured; the output of one that failed goes to the log."""
+    """Return the measurements of a process that has ended; if it failed, its output is added to the log."""
     written = folder / "result.json"
     output = folder / "log"
     error = f"the run ended with code {code} and no result; see {log}."
@@ -90,9 +90,15 @@ def run_all(
     gpus: Sequence[str | None] = (None,),
     jobs_per_gpu: int = 1,
 ) -> None:
-    """Run jobs in their order, some at a time on each GPU; whatever ends this early also ends the runs.
+    """Run jobs in their order, some at a time on each GPU; an exception ends all runs.
 
-    `finished` is called with each result as its run ends, and `log` takes the output of runs that fail.
+    Args:
+        jobs: What is run.
+        launch: Starts a job.
+        finished: Is called with each result when its run ends.
+        log: The output of runs that fail is added to this file.
+        gpus: Where the jobs run, as for `Launch`.
+        jobs_per_gpu: How many run at a time on each.
     """
 
     def ended(job: Job, code: int, folder: Path) -> None:

@@ -93,11 +93,12 @@ class Curve:
 
     def __init__(self, every: int, timer: LoopTimer) -> None:
         self.points: list[dict[str, Any]] = []
-        """By iterations: `step` (iterations done), `seconds` of the loop so far, `psnr`, `ssim`, `lpips` and
-        `gaussians`. The run's last iteration is not among them: the evaluation after the run measures it."""
+        """In the order of iterations, each with `step` (iterations done), `seconds` of the loop so far, `psnr`, `ssim`,
+        `lpips` and `gaussians`. The run's last iteration is not among them: the evaluation after the run measures it.
+        """
         self._every = every
         self._timer = timer
-        self._network: Any = None
+        self._lpips: Any = None  # The network of LPIPS, once it is needed
 
     def attach(self, trainer: Any) -> None:
         """Register with a nerfstudio Trainer that is set up."""
@@ -105,9 +106,10 @@ class Curve:
         def measure(step: int) -> None:
             pipeline = trainer.pipeline
             with self._timer.stopped(), undisturbed(pipeline):
-                self._network = self._network or evaluate.load_lpips()
+                if self._lpips is None:
+                    self._lpips = evaluate.load_lpips()
                 views = pipeline.datamanager.fixed_indices_eval_dataloader
-                measured = evaluate.quality(pipeline.model, views, self._network)
+                measured = evaluate.quality(pipeline.model, views, self._lpips)
             self.points.append(point(step + 1, self._timer.seconds, measured, int(pipeline.model.num_points)))
 
         iterations = tuple(range(self._every - 1, trainer.config.max_num_iterations - 1, self._every))

@@ -72,20 +72,24 @@ def choose(training: Sequence[str], clean: Sequence[str], generator: np.random.G
 
 
 def pose(thing: CutOut, area: float, generator: np.random.Generator) -> Pixels:
-    """Return a cut-out that leans, has an area in px, and fades over a pixel at its edge. [H, W, 4]"""
+    """Return a cut-out as it comes into a photo: scaled to an area in px², mirrored or not, and turned. [H, W, 4]
+
+    Its opacity falls over a pixel at its edge, and is 0 where the cut-out has no colours.
+    """
     scale = (area / thing.area) ** 0.5
     image = Image.fromarray(thing.pixels)
     if generator.random() < 0.5:
         image = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
-    size = (max(1, round(scale * image.width)), max(1, round(scale * image.height)))
+    width = max(1, round(scale * image.width))
+    height = max(1, round(scale * image.height))
     angle = generator.uniform(-LARGEST_ANGLE, LARGEST_ANGLE)
-    image = image.resize(size, Image.Resampling.LANCZOS).rotate(angle, Image.Resampling.BICUBIC, expand=True)
-    pixels = np.array(image)
+    scaled = image.resize((width, height), Image.Resampling.LANCZOS)
+    turned = scaled.rotate(angle, Image.Resampling.BICUBIC, expand=True)
+    pixels = np.array(turned)
     inside = pixels[..., 3] > 127
-    # A border keeps the filter from taking the image's sides for more of the thing.
+    # The filter repeats the pixels at the image's sides: with a border of 0 the thing fades there, too.
     bordered = Image.fromarray(np.pad(np.uint8(255 * inside), 1))
     soft = np.asarray(bordered.filter(ImageFilter.BoxBlur(1)))[1:-1, 1:-1]
-    # Colours are known inside only.
     pixels[..., 3] = np.where(inside, soft, 0)
     return pixels
 

@@ -35,16 +35,20 @@ Array = NDArray[np.float64]
 
 
 def draw_gains(views: int, spread: float, white_balance: float, mean: float, seed: int) -> tuple[Array, Array]:
-    """Draw gains of photos, at least one, [V] and their channels' factors [V, 3], as at the top of this module."""
+    """Draw the gains [V] of one photo or more, and the factors of their channels [V, 3].
+
+    The gains' geometric mean is `mean`, and of several gains the largest is `spread` times the smallest. A photo's
+    factors lie between 1 + `white_balance` and its inverse, and their product is 1.
+    """
     generator = np.random.default_rng(seed)
     exponents = np.zeros(views)
     if views > 1:
         exponents = generator.permutation(views) / (views - 1) - 0.5
     gains = mean * spread**exponents
-    factors = generator.uniform(-1, 1, (views, 3))
-    factors -= factors.mean(axis=1, keepdims=True)
-    # Less their mean, factors can be up to 4/3 as large.
-    return gains, (1 + white_balance) ** (0.75 * factors)
+    powers = generator.uniform(-1, 1, (views, 3))
+    powers -= powers.mean(axis=1, keepdims=True)
+    powers *= 0.75  # Without their mean they lie between −4/3 and 4/3.
+    return gains, (1 + white_balance) ** powers
 
 
 def linear_light(values: Array) -> Array:

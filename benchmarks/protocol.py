@@ -160,6 +160,10 @@ def set_dotted(config: Any, path: str, value: Any) -> None:
 
 
 def _child(node: Any, name: str, path: str, parent: str) -> Any:
+    """Return the field or key of a node in a tree of settings; raise ValueError if the node has none of this name.
+
+    The sentence of the error names the whole path, and the node's own path `parent`, which is "" for the root.
+    """
     where = parent or "the config"
     if not isinstance(node, dict) and not dataclasses.is_dataclass(node):
         raise ValueError(f"override {path!r}: {where} is {node!r}, which has no settings; shorten the path.")
@@ -177,6 +181,7 @@ def _child(node: Any, name: str, path: str, parent: str) -> Any:
 
 
 def _as_type_of(old: Any, value: Any, path: str) -> Any:
+    """Return a value from YAML in the type of an old one; raise ValueError, which names the path, if it has none."""
     if old is None or value is None or (type(old) is type(value) and type(old) in (bool, int, float, str)):
         return value
     if not isinstance(old, bool) and not isinstance(value, bool):

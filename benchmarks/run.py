@@ -84,10 +84,11 @@ def build_config(scene: Scene, row: Row, seed: int, root: Path, work: Path) -> T
 
 
 def _dataparser_of(scene: Scene, config: TrainerConfig) -> Any:
-    """The config of a scene's dataparser, for a method with this config.
+    """Return the config of a scene's dataparser for a method, with the scene's options.
 
-    It is what `ns-train METHOD PARSER` takes: of the method's default parser the method's own settings, which may read
-    SfM points. Raises ValueError if there is no such dataparser or setting.
+    As `ns-train METHOD PARSER` does, it begins with the method's own config of the dataparser if that is the method's
+    default one, for example because it reads SfM points. Otherwise it begins with the registered config of this name.
+    Raises ValueError if there is no such dataparser or setting.
     """
     from nerfstudio.configs.dataparser_configs import all_dataparsers
 

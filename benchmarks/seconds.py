@@ -58,7 +58,7 @@ class Protocol:
     """What this benchmark runs."""
 
     captures: dict[str, str]  # Folders of photos below a root, by the captures' names
-    every: dict[str, int] = field(default_factory=dict)  # Captures of whose photos only every so many is taken
+    every: dict[str, int] = field(default_factory=dict)  # n for captures whose every n-th photo alone is taken
     runs: int = 3  # How often each is measured
 
 
@@ -68,7 +68,7 @@ class Run:
 
     capture: str
     folder: str  # Of its photos
-    every: int  # Every so many of them is taken
+    every: int  # Every n-th of them is taken
     number: int  # Of the run, from 0 on
     label: str
     program: str  # Of `PROGRAMS`
@@ -120,9 +120,10 @@ def parts_of(lines: Sequence[str], program: str, start: float) -> list[Part]:
 
 
 def measure(run: Run, work: Path) -> dict[str, Any]:
-    """Run the command in a folder, and return its seconds and parts.
+    """Run the command in a folder, and return its seconds, parts and number of photos.
 
-    Raises subprocess.CalledProcessError if it fails; what it printed is in `work/log`.
+    Call this once in a process: the seconds of all cores are those of all commands that the process has run. Raises
+    subprocess.CalledProcessError if the command fails; what it printed is in `work/log`.
     """
     photos = Path(run.folder)
     if run.every > 1:
@@ -137,12 +138,12 @@ def measure(run: Run, work: Path) -> dict[str, Any]:
     words = [str(photos), str(work / "out"), *run.words]
     if run.program == "sadgs":
         words.insert(1, "--output")
-    start = time.time()
+    start_time = time.time()  # By the clock of the trace
     begin = time.perf_counter()
     run_program(code, words, work, environment)
     seconds = time.perf_counter() - begin
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    parts = parts_of(trace.read_text("utf8").splitlines(), run.program, start)
+    parts = parts_of(trace.read_text("utf8").splitlines(), run.program, start_time)
     rounded = [[part.process, part.name, round(part.begin, 3), round(part.end, 3)] for part in parts]
     return {
         "seconds": round(seconds, 3),
@@ -153,7 +154,7 @@ def measure(run: Run, work: Path) -> dict[str, Any]:
 
 
 def link_photos(photos: Path, every: int, folder: Path) -> Path:
-    """Make a folder of links to every so many photos of another, and return it."""
+    """Make a folder of links to every n-th photo of another, and return it."""
     folder.mkdir()
     for name in photos_of(photos)[::every]:
         (folder / name.replace("/", "-")).symlink_to(photos / name)
@@ -161,13 +162,14 @@ def link_photos(photos: Path, every: int, folder: Path) -> Path:
 
 
 def row_of(run: Run, work: Path, log: Path) -> dict[str, Any]:
-    """Measure a run, and return its row, also that of one that fails; the output of that is added to a log."""
+    """Measure a run, and return its row; if the run fails, its output is added to a log."""
     date = now()
     try:
         measured = measure(run, work)
     except subprocess.CalledProcessError as error:
+        output = (work / "log").read_text(errors="replace")
         with log.open("a") as file:
-            file.write(f"=== {run.key}\n{(work / 'log').read_text(errors='replace')}\n")
+            file.write(f"=== {run.key}\n{output}\n")
         return run.row(date, status="failed", error=f"{run.program} ended with code {error.returncode}; see {log}.")
     return run.row(date, status="ok", error=None, **measured, **about())
 

@@ -74,7 +74,7 @@ def run_side_by_side(
     gpus: Sequence[str | None] = (None,),
     jobs_per_gpu: int = 1,
 ) -> None:
-    """Run jobs in their order, some at a time on each GPU; whatever ends this early also ends their processes.
+    """Run jobs in their order, some at a time on each GPU; an exception ends all their processes.
 
     Args:
         jobs: What `launch` knows how to start.
@@ -120,7 +120,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 
 @contextlib.contextmanager
 def sigterm_exits() -> Iterator[None]:
-    """Let SIGTERM end the program by an exception meanwhile, which also ends the processes."""
+    """Let SIGTERM raise SystemExit within this context, so that `run_side_by_side` ends its processes."""
     previous = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
         yield

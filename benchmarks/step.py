@@ -108,7 +108,7 @@ class Step:
 
     @torch.no_grad()
     def project(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The forward projection alone, of Gaussians that are activated before: our kernel, or gsplat's."""
+        """Project the Gaussians, without their activation and without gradients, by our kernel or by gsplat's."""
         if kernels.use_triton(self.params["means"]):
             from sadgs_ns.kernels.projection_forward import project_forward as project
         else:
@@ -117,7 +117,7 @@ class Step:
         return project(means, quats, scales, opacities, self.viewmats, self.Ks, self.width, self.height)
 
     def forget_gradients(self) -> None:
-        """As a step begins."""
+        """Set all gradients to None, as a step does when it begins."""
         for parameter in self.params.values():
             parameter.grad = None
 

@@ -115,6 +115,7 @@ class Worker:
             raise
 
     def _listen(self, on_event: OnEvent) -> Any:
+        """Pass events on to `on_event` until the result comes, and return it; raise if the process ends without one."""
         error: dict[str, Any] | None = None
         rest = b""
         with self._events.open("rb") as file:

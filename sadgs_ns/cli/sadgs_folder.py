@@ -29,7 +29,7 @@ _OPTION_NAMES = {
 
 @dataclass
 class Settings:
-    """What is noted in settings.json, which lacks what is None."""
+    """The content of settings.json; fields that are None are left out there."""
 
     # What the options of the command decide
     source: str | None = None  # Path without links

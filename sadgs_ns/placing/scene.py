@@ -22,7 +22,7 @@ _UNFINISHED = ("frames.partial", "photos.partial", "model.partial", "models", "u
 
 @dataclasses.dataclass
 class SceneSettings:
-    """What a scene is made of; its fields are the keys of the folder's settings.json, which lacks those of None."""
+    """The content of settings.json in a scene's work folder; fields that are None are left out there."""
 
     source: str | None = None  # Path without links
     photos: list[str] = dataclasses.field(default_factory=list)  # or videos of a folder; a single video has no name

@@ -153,7 +153,9 @@ def main() -> None:
 
 
 def _begin_compiler() -> None:
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # Only the first process tells the run, which waits until it ends.
+    """Prepare a forked process for compiling."""
+    # Only the first process prints to the run, which reads until the last writer has ended.
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     threading.Thread(target=_end_with_the_run, daemon=True).start()
 
 

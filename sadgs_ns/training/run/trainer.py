@@ -242,7 +242,7 @@ class SadgsTrainer(Trainer):
         return training_step(model, groups, opacity_reg, update, factors, nonfinite_flag)
 
     def _own_requests(self) -> StepRequests:
-        """Return what this process asks of all."""
+        """Return what this process asks all processes to do after the step."""
         signals: tuple[int, ...] = ()
         if self._interrupts.received is not None:
             signals = (self._interrupts.received,)
