@@ -151,21 +151,28 @@ class Benchmark:
     """label of the row that the columns Ratio and Matched compare with"""
 
     def selected(self) -> list[Job]:
-        """The protocol's jobs that are asked for, all checked before the first one runs."""
+        """Return the protocol's jobs that the options select; raise ValueError if an option or a scene is wrong."""
         from benchmarks.datasets import check
 
-        chosen = protocol.load(self.protocol)
-        try:
-            jobs = [j for j in chosen.jobs() if re.search(self.only, f"{j.scene.name}/{j.row.label}/{j.seed}")]
-        except re.error as error:
-            raise ValueError(f"--only {self.only!r} is not a regular expression ({error}).") from error
-        if self.aligned:
-            jobs = [dataclasses.replace(job, row=dataclasses.replace(job.row, aligned=True)) for job in jobs]
+        loaded = protocol.load(self.protocol)
+        jobs = []
+        for job in loaded.jobs():
+            run = f"{job.scene.name}/{job.row.label}/{job.seed}"
+            try:
+                is_selected = re.search(self.only, run)
+            except re.error as error:
+                raise ValueError(f"--only {self.only!r} is not a regular expression ({error}).") from error
+            if not is_selected:
+                continue
+            if self.aligned:
+                row = dataclasses.replace(job.row, aligned=True)
+                job = dataclasses.replace(job, row=row)
+            jobs.append(job)
         if not jobs:
             raise ValueError(f"--only {self.only!r} leaves no run; it is searched for in scene/label/seed.")
         if self.jobs_per_gpu < 1:
             raise ValueError(f"--jobs-per-gpu must be 1 or more, not {self.jobs_per_gpu}.")
-        check(jobs, self.scenes, chosen.source)
+        check(jobs, self.scenes, loaded.source)
         return jobs
 
     def __call__(self) -> int:

@@ -17,14 +17,15 @@ _HEADER_OF_TRUTHS = ["drawn", "cameras", "last adjustment", "centres, % of exten
 
 
 def markdown(rows: Sequence[Row], labels: Mapping[str, str] | None = None) -> str:
-    """Return a table with a line for each capture, label and variant; "" without any row.
+    """Return a Markdown table with a line for each capture, label and variant, or "" if there is no line.
 
-    Numbers are means over seeds or over pairs of them, the worst view is the worst of all pairs, and seconds are the
-    medians. `labels` chooses and names the rows' labels; by default all are shown.
+    Most numbers are means over seeds or over pairs of seeds. The worst view is the worst of all pairs, and seconds are
+    medians over seeds. `labels` gives the labels to show and their names in the table; by default all are shown.
     """
     lines = []
     for names, row in _chosen(rows, labels):
-        if "pairs" in row:
+        is_of_capture = "pairs" in row
+        if is_of_capture:
             lines.append([*names, *_cells(row)])
     if not lines:
         return ""

@@ -23,9 +23,9 @@ class LoopTimer:
 
     def __init__(self) -> None:
         self.seconds: float = 0.0
-        """Time in the loop, until it was last stopped."""
+        """Seconds in the loop before the timer last stopped."""
         self.peak_gb: float | None = None
-        """Largest memory that tensors took in the loop, in 10⁹ bytes; None without a GPU."""
+        """Largest GPU memory that tensors took in the loop, in 10⁹ bytes; None without a GPU."""
         self.finished: bool = False
         """Whether the last iteration has ended."""
         self._start = 0.0

@@ -232,16 +232,23 @@ class Command:
     """of the photos, things and places"""
 
     def scenes(self) -> list[Path]:
-        """Return the folders of the scenes; raise ValueError if there is none or a copy would overwrite other files."""
-        folders = sorted(path for path in self.root.iterdir() if path.is_dir()) if self.root.is_dir() else []
-        found = [path for path in folders if (path / SPARSE).is_dir() and (path / "images").is_dir()]
+        """Return the folders of the scenes to copy, sorted.
+
+        Raises ValueError if there is none, if `only` names another one, or if a copy would overwrite other files.
+        """
+        found = []
+        if self.root.is_dir():
+            for path in sorted(self.root.iterdir()):
+                if (path / SPARSE).is_dir() and (path / "images").is_dir():
+                    found.append(path)
         if not found:
             raise ValueError(f"{self.root} holds no folder with images and {SPARSE}; give that of the scenes.")
         if self.only:
             wanted = self.only.split(",")
-            absent = sorted({*wanted} - {path.name for path in found})
-            if absent:
-                raise ValueError(f"--only names {absent[0]!r}; {self.root} has {', '.join(p.name for p in found)}.")
+            names = [path.name for path in found]
+            unknown = sorted(set(wanted) - set(names))
+            if unknown:
+                raise ValueError(f"--only names {unknown[0]!r}; {self.root} has {', '.join(names)}.")
             found = [path for path in found if path.name in wanted]
         for scene in found:
             copy = self.out / scene.name

@@ -157,18 +157,29 @@ class Source:
         joined: Mapping[str, Sequence[str]] | None = None,
         joined_scenes: Sequence[str] = (),
     ) -> list[Any]:
-        """Arguments of `plots.quality`; `joined` names several labels of which some scenes have one line together."""
+        """Return the arguments of `plots.quality`.
+
+        Args:
+            rows: The file of the rows, or several.
+            scenes: The scenes to draw.
+            labels: The labels to draw in each scene, and their names in the figure.
+            joined: Names in the figure, and for each the labels whose runs one line joins.
+            joined_scenes: The scenes that have these lines.
+        """
         found = self.groups(rows)
         joined = joined or {}
         named = []
         for scene in scenes:
             for label, name in labels.items():
-                named.append(((scene, name), table.group_of(found, scene, label)))
+                results = table.group_of(found, scene, label)
+                named.append(((scene, name), results))
             if scene not in joined_scenes:
                 continue
-            for name, together in joined.items():
-                runs = [run for label in together for run in table.group_of(found, scene, label)]
-                named.append(((scene, name), runs))
+            for name, joined_labels in joined.items():
+                joined_results: list[Any] = []
+                for label in joined_labels:
+                    joined_results += table.group_of(found, scene, label)
+                named.append(((scene, name), joined_results))
         return [named, list(joined)]
 
 

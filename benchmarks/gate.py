@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,21 +67,25 @@ def read(path: Path) -> Baseline:
 
 
 def regressions(baseline: Baseline, jobs: Iterable[Job], results: Iterable[Result]) -> list[str]:
-    """What is worse than the baseline allows, a line each; also rows and metrics that jobs should have measured."""
-    ok = {result["key"]: result for result in results if result["status"] == "ok"}
-    runs: dict[str, list[Result | None]] = {}
+    """Return a sentence for each metric that is worse than the baseline allows.
+
+    A row has a sentence, too, if it is not in the baseline, if no job is of it, or if one of its runs did not end well;
+    and so has a metric that a run did not measure.
+    """
+    good = {result["key"]: result for result in results if result["status"] == "ok"}
+    runs: dict[str, list[Result | None]] = defaultdict(list)  # Results of each row's jobs; None if there is no good one
     for job in jobs:
-        runs.setdefault(f"{job.scene.name}/{job.row.label}", []).append(ok.get(job.key))
+        row = f"{job.scene.name}/{job.row.label}"
+        runs[row].append(good.get(job.key))
     lines = [f"{row} is not in the baseline, so nothing judges it; add it." for row in runs if row not in baseline]
     for row, metrics in baseline.items():
-        group = runs.get(row, [])
-        measured = [result for result in group if result is not None]
-        if not group:
+        if row not in runs:
             lines.append(f"{row} is missing from the results: no such run was asked for.")
             continue
-        if len(measured) < len(group):
-            done = f"{len(measured)} of {len(group)} runs ended well"
-            lines.append(f"{row} is missing from the results: {done}.")
+        measured = [result for result in runs[row] if result is not None]
+        asked_for = len(runs[row])
+        if len(measured) < asked_for:
+            lines.append(f"{row} is missing from the results: {len(measured)} of {asked_for} runs ended well.")
             continue
         for name, metric in metrics.items():
             values = table.values(measured, name)

@@ -113,8 +113,8 @@ def train(config: Any, steps_per_save: int) -> list[Path]:
 def run_lines(name: str, checkpoints: Sequence[Path]) -> Iterator[str]:
     """Yield a line for each group of tensors in each checkpoint of a run, and for each parameter in the last one.
 
-    A group that has no tensors has no line: the strategy has none when densification is over, and the mean of the
-    parameters runs over the last iterations only, and becomes the parameters in the last one.
+    A group without tensors has no line. The strategy has no tensors after densification. The mean of the parameters has
+    some only during the last iterations; at the end of the last iteration the mean replaces the parameters.
     """
     for path in checkpoints:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
@@ -122,7 +122,8 @@ def run_lines(name: str, checkpoints: Sequence[Path]) -> Iterator[str]:
         for group, tensors in groups.items():
             if tensors:
                 yield line_of(f"{name}, {checkpoint['step'] + 1} iterations: {group}", tensors)
-        if path == checkpoints[-1]:
+        is_last = path == checkpoints[-1]
+        if is_last:
             for parameter, tensor in sorted(groups["parameters"].items()):
                 yield line_of(f"{name}, end: {parameter}", {parameter: tensor})
 

@@ -196,11 +196,14 @@ def adam() -> Results:
 
 
 def compositing() -> Results:
-    """Composite two views, with and without absolute gradients, and with and without gradients of alphas."""
+    """Composite two views, with and without absolute gradients, and with and without gradients by the alphas."""
 
-    def draw(reads_alphas: bool, **arguments: Any) -> list[Tensor]:
+    def composite(reads_alphas: bool, **arguments: Any) -> list[Tensor]:
+        """Return the results that `with_gradients` differentiates."""
         renders, alphas = rasterize_to_pixels(**arguments)
-        return [renders, alphas] if reads_alphas else [renders]
+        if reads_alphas:
+            return [renders, alphas]
+        return [renders]
 
     found: Results = {}
     for absgrad in (False, True):
@@ -216,7 +219,7 @@ def compositing() -> Results:
                 "opacities": projected.opacities,
             }
             function = partial(
-                draw, reads_alphas, width=WIDTH, height=HEIGHT,
+                composite, reads_alphas, width=WIDTH, height=HEIGHT,
                 isect_offsets=lists.starts, flatten_ids=lists.ids, absgrad=absgrad,
             )  # fmt: skip
             found |= named(f"absgrad {absgrad}, alphas {reads_alphas}", with_gradients(random, function, inputs))
@@ -297,7 +300,10 @@ def projections() -> Results:
 
 
 def forward_projections() -> Results:
-    """Project Gaussians, with one radius and two; what is not drawn has no values."""
+    """Project Gaussians, with one radius and with two.
+
+    Only radii are hashed of Gaussians that are not drawn, because the kernel does not write their other outputs.
+    """
     found: Results = {}
     for per_axis in (False, True):
         random = Random(15)
@@ -305,9 +311,11 @@ def forward_projections() -> Results:
         opacities = random.uniform(0.0, 1.0, N)
         arguments = (world.means, world.quats, world.scales, opacities, world.viewmats, world.Ks, WIDTH, HEIGHT)
         with mock.patch.object(gsplat_compat, "RADII_PER_AXIS", per_axis):
-            radii, *others = project_forward(*arguments)
-        seen = gsplat_compat.drawn(radii, others[0])
-        results = {"radii": radii} | {f"output {place}": value[seen] for place, value in enumerate(others)}
+            radii, means2d, depths, conics = project_forward(*arguments)
+        is_drawn = gsplat_compat.drawn(radii, means2d)
+        results = {"radii": radii}
+        for place, output in enumerate((means2d, depths, conics)):
+            results[f"output {place}"] = output[is_drawn]
         found |= named(f"radius per axis {per_axis}", results)
     return found
 

@@ -236,12 +236,17 @@ class Rounds:
             yield
 
     def _prepare(self, name: str, phase: Phase, state: State) -> None:
-        """Compile what a twin's steps need, and count their launches."""
+        """Train the warm steps of a phase, and count the launches of a step if there is a GPU.
+
+        `_attempt` has put the twin `name` in its kernel's place.
+        """
         state.restore()
         train_steps(self._trainer, phase.begin, WARM_STEPS)
         if torch.cuda.is_available():
-            every = self._trainer.pipeline.model.strategy.windows.eta_every
-            launches = count_launches(self._trainer, phase, state, min(every, phase.steps))
+            # A step that observes η launches more kernels; over this many steps, the mean has its share of one.
+            steps_per_observation = self._trainer.pipeline.model.strategy.windows.eta_every
+            num_steps = min(steps_per_observation, phase.steps)
+            launches = count_launches(self._trainer, phase, state, num_steps)
             self._measured[name].launches[phase.name] = launches
 
     def _time(self, name: str, phase: Phase, state: State) -> None:

@@ -152,7 +152,8 @@ def set_dotted(config: Any, path: str, value: Any) -> None:
     node = config
     for i, name in enumerate(parents):
         node = _child(node, name, path, ".".join(parents[:i]))
-    value = _as_type_of(_child(node, last, path, ".".join(parents)), value, path)
+    present = _child(node, last, path, ".".join(parents))
+    value = _converted(value, present, path)
     if isinstance(node, dict):
         node[last] = value
     else:
@@ -180,22 +181,28 @@ def _child(node: Any, name: str, path: str, parent: str) -> Any:
     return children[name]
 
 
-def _as_type_of(old: Any, value: Any, path: str) -> Any:
-    """Return a value from YAML in the type of an old one; raise ValueError, which names the path, if it has none."""
-    if old is None or value is None or (type(old) is type(value) and type(old) in (bool, int, float, str)):
+def _converted(value: Any, present: Any, path: str) -> Any:
+    """Convert a value from YAML to the type of a setting's present value.
+
+    The value stays as it is if either is None, or if both are numbers. Raises ValueError, which names the setting's
+    path, if the value cannot be converted.
+    """
+    if present is None or value is None:
         return value
-    if not isinstance(old, bool) and not isinstance(value, bool):
-        if isinstance(old, (int, float)) and isinstance(value, (int, float)):
+    if type(present) is type(value) and type(present) in (bool, int, float, str):
+        return value
+    if not isinstance(present, bool) and not isinstance(value, bool):  # Python counts a bool as an int.
+        if isinstance(present, (int, float)) and isinstance(value, (int, float)):
             return value
-        if isinstance(old, float) and isinstance(value, str):
+        if isinstance(present, float) and isinstance(value, str):
             with contextlib.suppress(ValueError):
                 return float(value)  # YAML 1.1 reads 1e-4 as text: a float needs a dot there.
-        if isinstance(old, Path) and isinstance(value, str):
+        if isinstance(present, Path) and isinstance(value, str):
             return Path(value)
-        if isinstance(old, (tuple, list)) and isinstance(value, list):
-            return type(old)(value)
-    kind = type(old).__name__
-    if isinstance(old, dict) or dataclasses.is_dataclass(old):
+        if isinstance(present, (tuple, list)) and isinstance(value, list):
+            return type(present)(value)
+    kind = type(present).__name__
+    if isinstance(present, dict) or dataclasses.is_dataclass(present):
         kind = "a group of settings"
     raise ValueError(f"override {path!r}: {value!r} is {type(value).__name__}, but the setting is {kind}.")
 

@@ -322,16 +322,22 @@ def load_in_one_process(job: Job, root: Path, work: Path, checkpoint: Path) -> A
 
 
 def software() -> dict[str, str | None]:
-    """Versions, of what was imported where that tells its own, and the commit of this checkout, if git knows it."""
+    """Return the versions of the packages and the commit of this checkout; None for a version that is unknown.
+
+    Without git there is no "commit".
+    """
     versions: dict[str, str | None] = {}
     for name in ("torch", "gsplat", "nerfstudio", "sadgs_ns"):
-        # Two installations in one folder have two metadata, of which the first need not be what runs.
-        versions[name] = getattr(sys.modules.get(name), "__version__", None)
-        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = versions[name] or importlib.metadata.version(name)
+        # The imported module comes first: with two installations in a folder, metadata may be those of the other one.
+        version = getattr(sys.modules.get(name), "__version__", None)
+        if not version:
+            with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+                version = importlib.metadata.version(name)
+        versions[name] = version
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     with contextlib.suppress(OSError):  # there is no git
-        versions["commit"] = subprocess.run(command, capture_output=True, text=True).stdout.strip() or None
+        described = subprocess.run(command, capture_output=True, text=True)
+        versions["commit"] = described.stdout.strip() or None
     return versions
 
 

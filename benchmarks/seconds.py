@@ -208,10 +208,10 @@ class Command(PhotoCommand):
         protocol = load(self.protocol)
         names = list(self.only) or list(protocol.captures)
         program = "sadgs"
-        words = ("--formats", self.formats)
+        options = ("--formats", self.formats)
         if self.cameras:
             program = "sadgs-process"
-            words = ()
+            options = ()
         site = ""
         if self.site is not None:
             site = str(self.site.resolve())
@@ -220,9 +220,19 @@ class Command(PhotoCommand):
             if name not in protocol.captures:
                 raise ValueError(f"--only names {name!r}; the protocol has {', '.join(protocol.captures)}.")
             folder = str(self.folder_of(protocol.captures[name]))
-            every = protocol.every.get(name, 1)
             for number in range(self.runs or protocol.runs):
-                runs.append(Run(name, folder, every, number, self.label, program, words, self.cold, site))
+                run = Run(
+                    capture=name,
+                    folder=folder,
+                    every=protocol.every.get(name, 1),
+                    number=number,
+                    label=self.label,
+                    program=program,
+                    words=options,
+                    is_cold=self.cold,
+                    site=site,
+                )
+                runs.append(run)
         return runs
 
     def __call__(self) -> int:

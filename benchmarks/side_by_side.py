@@ -107,11 +107,14 @@ def run_side_by_side(
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
-    """End a process and what it started."""
+    """End a process that has a session of its own, with all processes of that session.
+
+    They get SIGTERM, and SIGKILL if the process itself has not ended after KILL_SECONDS.
+    """
     try:
         os.killpg(process.pid, signal.SIGTERM)
         process.wait(KILL_SECONDS)
-    except ProcessLookupError:
+    except ProcessLookupError:  # All have ended.
         pass
     except subprocess.TimeoutExpired:
         os.killpg(process.pid, signal.SIGKILL)

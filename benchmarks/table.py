@@ -278,9 +278,10 @@ _PRINTED += ("peak", "seeds")
 
 
 def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) -> str:
-    """Runs as a Markdown table, a line each, with some of COLUMNS; the first is empty where it repeats the line above.
+    """Return a Markdown table with a line for each run and some of COLUMNS.
 
-    Raises ValueError if there is no such column or, with `strict`, a number is missing.
+    A cell of the first column is empty if it would repeat the one above. Raises ValueError if there is no such column,
+    or if a number is missing; without `strict` a missing number is NOTHING.
     """
 
     def cell(column: Callable[[Run], str], run: Run) -> str:
@@ -294,13 +295,23 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) ->
     unknown = {*columns} - COLUMNS.keys()
     if unknown:
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
-    known = [COLUMNS[name] for name in columns]
-    lines = [[cell(column, run) for _, column in known] for run in runs]
-    firsts = [line[0] for line in lines]
-    for line, above in zip(lines[1:], firsts[:-1], strict=True):
-        if line[0] == above:
+    header = []
+    functions = []
+    for name in columns:
+        title, function = COLUMNS[name]
+        header.append(title)
+        functions.append(function)
+    lines = []
+    above = None
+    for run in runs:
+        line = [cell(function, run) for function in functions]
+        first = line[0]
+        if first == above:
             line[0] = ""
-    return grid([header for header, _ in known], lines, sum(name in WORDS for name in columns))
+        lines.append(line)
+        above = first
+    words = [name for name in columns if name in WORDS]
+    return grid(header, lines, names=len(words))
 
 
 def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
