@@ -374,7 +374,7 @@ def statistics() -> Results:
 
 
 def structure_tensor() -> Results:
-    """Compute S̄ of an image, and of another one with a mask and the paper's ε."""
+    """Compute S̄ of one image twice: with the defaults, and with a mask and as the paper prints eq. 3 to 5."""
     random = Random(12)
     images = random.uniform(0.0, 1.0, 1, 7, 70, 3)
     masks = random.uniform(0.0, 1.0, 1, 7, 70) < 0.8
