@@ -264,11 +264,14 @@ def project(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
     width: int, height: int, near_plane: float = NEAR_PLANE,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
-    """Do what `gsplat_compat.project` does, but with one kernel backward. Opacities and `Ks` get no gradient.
+    """Do what `gsplat_compat.project` does, with a backward pass of one kernel.
+
+    Opacities and `Ks` get no gradient.
 
     Returns:
-        The results of `gsplat_compat.project`, whose radii may be set to 0 in place until the backward pass; and
-        `means`, for everything else that depends on the centres, whose gradient the backward kernel then adds.
+        The four results of `gsplat_compat.project`, and `means`. The radii may be set to 0 in place until the backward
+        pass. Whatever else depends on the centres is to be computed from the returned `means`: the backward kernel then
+        adds its gradient to that of the projection.
     """
     tensors = (value.contiguous() for value in (means, quats, scales, opacities, viewmats, Ks))
     return _Project.apply(*tensors, width, height, near_plane)  # type: ignore[return-value]

@@ -39,19 +39,22 @@ def _load_ellipse(
     means2d, radii, conics, opacities, g, exists, tile_width, tile_height,
     PER_GAUSSIAN: tl.constexpr, TILE: tl.constexpr,
 ):  # fmt: skip
-    """Load the values that decide which tiles the Gaussians with indices g in C · N reach.
+    """Load the values that decide which tiles the Gaussians with numbers g reach, of N Gaussians in each of C views.
 
     Returns:
-        The ellipse: its centre x, y; the conic a, b, c; the level 2 ln(255 α) at which it ends; the conic's
-        determinant; whether these are proper numbers, without which every tile of gsplat's is listed; the first and one
-        past the last column of tiles. Then the first and one past the last row of tiles.
+        The ellipse, a tuple: its centre x, y; the conic a, b, c; the level 2 ln(255 α) at which the ellipse ends; the
+        conic's determinant; `proper`; the first column of tiles; and one past the last column.
+        The first row of tiles, and one past the last row.
+
+        `proper` is whether the determinant is above 1e-30 and finite and the level below 1e30. If not, the Gaussian is
+        listed in all tiles in which gsplat lists it.
     """
     rx = tl.load(radii + PER_GAUSSIAN * g, exists, 0).to(tl.float32)
     ry = rx
     if PER_GAUSSIAN == 2:
         ry = tl.load(radii + 2 * g + 1, exists, 0).to(tl.float32)
     opacity = 255.0 * tl.load(opacities + g, exists, 0.0)
-    drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat leaves what it culls unwritten
+    drawn = exists & (rx > 0) & (ry > 0) & (opacity >= 1)  # gsplat writes no centre of a culled one
     x = tl.load(means2d + 2 * g, drawn, 0.0)
     y = tl.load(means2d + 2 * g + 1, drawn, 0.0)
     drawn = drawn & (tl.abs(x) < float("inf")) & (tl.abs(y) < float("inf"))
@@ -60,9 +63,9 @@ def _load_ellipse(
     a = tl.load(conics + 3 * g, drawn, 1.0)
     b = tl.load(conics + 3 * g + 1, drawn, 0.0)
     c = tl.load(conics + 3 * g + 2, drawn, 1.0)
-    # The determinant of a thin conic cancels in float32, as does gsplat's exponent: its rounding raises the level.
+    # The determinant of a thin conic would cancel in float32. gsplat's exponent does: its rounding raises the level.
     determinant = (a.to(tl.float64) * c.to(tl.float64) - b.to(tl.float64) * b.to(tl.float64)).to(tl.float32)
-    proper = (determinant > 1e-30) & (determinant < float("inf"))  # otherwise every tile of gsplat's is listed
+    proper = (determinant > 1e-30) & (determinant < float("inf"))
     a = tl.where(proper, a, 1.0)
     b = tl.where(proper, b, 0.0)
     c = tl.where(proper, c, 1.0)
