@@ -15,7 +15,10 @@ UNSUPPORTED_CAMERAS = {"FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE"}  # COLMAP's c
 
 
 def read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[View]]:
-    """Return the images' names and views; raise InputError if there is none, or one makes no sense to nerfstudio."""
+    """Return the names and the views of all images.
+
+    Raises InputError if there is no image, or if nerfstudio cannot use a pose or a camera.
+    """
     stored = colmap.read_cameras(cameras_path)
     poses = colmap.read_poses(poses_path)
     if not poses:
@@ -28,10 +31,14 @@ def read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[Vi
             raise InputError(f"{where} has a rotation that is no unit quaternion: run COLMAP's mapper again.")
         if camera_id not in stored:
             raise InputError(f"{where} has camera {camera_id}, which {cameras_path} lacks: take both of one model.")
-    called = {camera_id: f"{cameras_path}: camera {camera_id}" for camera_id in stored}
-    cameras = {camera_id: _camera(stored[camera_id], where) for camera_id, where in called.items()}
-    kinds = {cameras[camera_id].fisheye for _, camera_id, _ in poses}
-    if len(kinds) > 1:
+    where_cameras = {}
+    cameras = {}
+    for camera_id, camera in stored.items():
+        where_camera = f"{cameras_path}: camera {camera_id}"
+        where_cameras[camera_id] = where_camera
+        cameras[camera_id] = _camera(camera, where_camera)
+    are_fisheye = [cameras[camera_id].fisheye for _, camera_id, _ in poses]
+    if any(are_fisheye) and not all(are_fisheye):
         problem = f"{cameras_path} mixes fisheye and other cameras, which nerfstudio cannot read"
         raise InputError(f"{problem}: undistort the images with `colmap image_undistorter`.")
     rotations = _rotations(np.array([pose[:4] for _, _, pose in poses]))
@@ -39,8 +46,9 @@ def read_views(poses_path: Path, cameras_path: Path) -> tuple[list[str], list[Vi
     views = []
     for (name, camera_id, pose), rotation in zip(poses, rotations, strict=True):
         centre = -rotation.T @ pose[4:]
+        where = f"{poses_path}: image {name}"
         names.append(name)
-        views.append(View(f"{poses_path}: image {name}", called[camera_id], rotation, centre, cameras[camera_id]))
+        views.append(View(where, where_cameras[camera_id], rotation, centre, cameras[camera_id]))
     return names, views
 
 

@@ -171,10 +171,13 @@ def color_profile(image: Image.Image) -> ImageCms.ImageCmsProfile | None:
 
 
 def read_small(path: Path) -> NDArray[np.uint8] | None:
-    """Return an image's colours [H, W, 3], of a JPEG scaled down as it is decoded; None if it cannot be read."""
+    """Return an image's colours, or None if it cannot be read. [H, W, 3]
+
+    A JPEG is scaled down while it is decoded, which takes less time.
+    """
     try:
         with Image.open(path) as image:
-            image.draft("RGB", (160, 160))  # It keeps at least as many px.
+            image.draft("RGB", (160, 160))  # The least width and height of a JPEG that is scaled down
             return np.asarray(image.convert("RGB"))
     except Exception:  # The check of images names broken ones.
         return None
@@ -262,10 +265,13 @@ def automatic_factor(image: Path, copy_of: Callable[[int], Path] | None = None) 
 
 
 def mask_name(folder: Path, image: str) -> Path | None:
-    """Return the file of an image's mask, relative to a folder of masks, by the first name in use that exists there.
+    """Return the path of an image's mask, relative to the folder of masks; None if the image has no mask.
 
-    None if the image has no mask.
+    Programs name masks in several ways. The first name that exists in the folder counts.
     """
     stem = PurePosixPath(image).with_suffix("")
-    names = [Path(f"{start}.png") for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask")]
-    return next((name for name in names if (folder / name).is_file()), None)
+    for start in (stem, image, f"{stem}_mask", f"{stem}.mask", f"{image}.mask"):
+        name = Path(f"{start}.png")
+        if (folder / name).is_file():
+            return name
+    return None

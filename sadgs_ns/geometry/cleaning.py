@@ -99,7 +99,10 @@ class Remaining:
 
     stays: Tensor  # Which Gaussians stay. bool [N]
     num_removed: dict[str, int]
-    """How many each option that is set takes of what those before it left, by the names of `Cleaning`'s fields."""
+    """How many Gaussians each option that is set takes away, by the names of `Cleaning`'s fields.
+
+    A Gaussian counts for the first option that takes it away.
+    """
     num_views: int  # Number of training views that were asked; 0 if none had to be
 
 

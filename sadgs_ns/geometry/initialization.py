@@ -62,14 +62,19 @@ def most_starting_points(pixels: int, per_pixel: float) -> float:
 
 
 def face_grid(pixels: int, per_pixel: float) -> int:
-    """Return how many points there are along each side of a face, 2 to `FACE_GRID`, given all training images' pixels.
+    """Return how many points lie along each side of a face, from 2 to `FACE_GRID`.
 
-    Points on the faces are large, and images of few pixels hardly show them.
+    There are fewer for images of few pixels: points on the faces are large, and such images hardly show them.
+
+    Args:
+        pixels: Number of pixels of all training images together.
+        per_pixel: Largest number of starting points for each of these pixels; 0 is no limit.
     """
     if per_pixel == 0:
         return FACE_GRID
-    most = FACES_SHARE * per_pixel * pixels
-    grid = math.isqrt(int(most / 6))
+    most_points = FACES_SHARE * per_pixel * pixels
+    points_per_face = int(most_points / 6)
+    grid = math.isqrt(points_per_face)
     return min(max(grid, 2), FACE_GRID)
 
 

@@ -234,9 +234,15 @@ def _shift(
 def _places(
     points: Sequence[pycolmap.Point3D], images: Sequence[pycolmap.Image], cameras: Sequence[pycolmap.Camera]
 ) -> np.ndarray:
-    """Return where I images show P points, from the principal point in focal lengths, NaN elsewhere. [I, P, 2]
+    """Return the places of P points in I images, in focal lengths from the principal point. [I, P, 2]
 
-    Distortion stays, since that of a wrong model may be as wrong as its focal lengths.
+    A point has NaN in an image that does not show it. The places are not undistorted, since the distortion of a wrong
+    model may be as wrong as its focal lengths.
+
+    Args:
+        points: Points of the model.
+        images: Its photos, all that its points are seen in.
+        cameras: The camera of each photo.
     """
     places = np.full((len(images), len(points), 2), np.nan, np.float32)
     rows = {image.image_id: i for i, image in enumerate(images)}

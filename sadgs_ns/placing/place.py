@@ -7,8 +7,9 @@ import dataclasses
 import os
 import shutil
 import statistics
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from sadgs_ns.data.checks.layouts import poses_elsewhere
 from sadgs_ns.events import span
@@ -106,25 +107,30 @@ def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
 
 
 def _take_frames(scene: Scene, folder: Path, lock: contextlib.ExitStack, report: Report, say: Say) -> list[Photo]:
-    """Write frames of the videos to a folder, unless an earlier run did, lock the scene, and read the frames."""
+    """Lock the scene, write frames of its videos to a folder unless an earlier run did, and return them as photos."""
     source = scene.options.source
     videos = scene.settings.photos
     if videos:
         say("aside", f"Frames of {len(videos)} videos are taken, each with a camera of its own.")
     is_new = not folder.exists()
-    frames = video_frames(source, videos, scene.options.frames) if is_new else []
+    frames: Iterable[tuple[str, Any]] = []
+    if is_new:  # Bad videos raise here, before anything is written.
+        frames = video_frames(source, videos, scene.options.frames)
     if scene.begun is not None and scene.begun.files:
         scene.settings.files = scene.begun.files
     else:
         scene.settings.files = photo_stamps(source, videos or [""])
-    lock.enter_context(scene.lock())  # It notes the settings, by which an interrupted run is resumed.
+    lock.enter_context(scene.lock())  # It writes the settings, by which an interrupted run is resumed.
     if is_new:
         partial = empty_folder(folder.with_name(f"{folder.name}.partial"))
         write_frames(frames, partial, lambda done: report("frames", done, scene.options.frames))
         partial.rename(folder)
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.jpg"))
-    photos = read_photos(folder, names, report)
-    return [dataclasses.replace(photo, camera=(os.path.dirname(photo.name), photo.size)) for photo in photos]
+    photos = []
+    for photo in read_photos(folder, names, report):
+        video = os.path.dirname(photo.name)
+        photos.append(dataclasses.replace(photo, camera=(video, photo.size)))
+    return photos
 
 
 def _read_folder(scene: Scene, lock: contextlib.ExitStack, report: Report) -> list[Photo]:

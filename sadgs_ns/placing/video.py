@@ -117,21 +117,28 @@ def pixels_of(frame: Any) -> np.ndarray:
 
 
 def video_frames(source: Path, names: Sequence[str], count: int) -> Iterator[tuple[str, np.ndarray]]:
-    """Return names and pictures of `count` sharp frames of a video, or of the videos with these names in a folder.
+    """Return file names and pictures of about `count` sharp frames. BGR [H, W, 3]
 
-    A video of a folder gives a share by its length, and the names of its frames begin with its own. Raise InputError if
-    a file is no video, or there are fewer than three frames.
+    If there are no names, `source` is the video. Otherwise it is the folder of the videos with these names. Each gives
+    frames in proportion to its length, at least one, and its frames are named as files in a folder of its name.
+
+    Raise InputError if a file is no video, or if there are fewer than three frames.
     """
-    totals = {name: count_frames(source / name) for name in names or [""]}
-    everything = max(sum(totals.values()), 1)
+    videos = names or [""]  # `source / ""` is `source` itself.
+    totals = {name: count_frames(source / name) for name in videos}
+    total_of_all = max(sum(totals.values()), 1)
 
-    def all_frames() -> Iterator[tuple[str, np.ndarray]]:
+    def frames_of_all() -> Iterator[tuple[str, np.ndarray]]:
         for name, total in totals.items():
-            share = max(1, min(total, count * total // everything))
+            share = count * total // total_of_all
+            share = max(1, min(total, share))
             for number, frame in sharpest_frames(source / name, share, max(total, 1)):
-                yield f"{name}/{number:05d}.jpg".lstrip("/"), frame
+                file_name = f"{number:05d}.jpg"
+                if name:
+                    file_name = f"{name}/{file_name}"
+                yield file_name, frame
 
-    frames = all_frames()
+    frames = frames_of_all()
     first = list(itertools.islice(frames, 3))
     if len(first) < 3:
         raise InputError(f"{source} gives {len(first)} frames; a reconstruction needs at least 3, better 30 or more.")

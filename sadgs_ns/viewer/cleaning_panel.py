@@ -130,14 +130,21 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return `cleaned` [H, W, 3] in [0, 1]; it is `rgb` once densification changed the Gaussians."""
+        """Return `cleaned`, a picture of the Gaussians that stay or go. [H, W, 3] in [0, 1]
+
+        It is `rgb` if the preview is off, and after densification, which changes the Gaussians.
+        """
         model = self._run.model
-        if self._shown == OFF or len(self._stays) != model.num_points:
+        is_outdated = len(self._stays) != model.num_points
+        if self._shown == OFF or is_outdated:
             return {OUTPUT: rendered["rgb"]}
-        chosen = self._stays if self._shown == STAYS else ~self._stays
+        if self._shown == STAYS:
+            chosen = self._stays
+        else:
+            chosen = ~self._stays
         try:
             drawn = model.get_outputs(camera, chosen)
-        except InputError:  # The camera is no pinhole: `rendered` is empty, and the model has warned of it.
+        except InputError:  # The camera is no pinhole: `rgb` shows nothing, and the model has warned of it.
             return {OUTPUT: rendered["rgb"]}
         return {OUTPUT: drawn["rgb"]}
 

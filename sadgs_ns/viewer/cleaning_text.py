@@ -28,19 +28,22 @@ def _is_box(crop: tuple[float, ...]) -> bool:
 
 
 def removal_sentences(cleaning: Cleaning, remaining: Remaining) -> list[str]:
-    """Say in a sentence for each option that is set how many Gaussians it takes of what those before it left."""
+    """Return a sentence for each option that is set: how many Gaussians it takes away.
+
+    A Gaussian counts for the first option that takes it away.
+    """
     sentences = []
     for option, number in remaining.num_removed.items():
-        which = _description(option, cleaning, remaining.num_views)
+        description = _description(option, cleaning, remaining.num_views)
         if number == 1:
-            sentences.append(f"1 Gaussian {which} is taken away.")
+            sentences.append(f"1 Gaussian {description} is taken away.")
         else:
-            sentences.append(f"{number:,} Gaussians {which} are taken away.")
+            sentences.append(f"{number:,} Gaussians {description} are taken away.")
     return sentences
 
 
 def _description(option: str, cleaning: Cleaning, num_views: int) -> str:
-    """Say which Gaussians an option takes away; it is the name of a field of `Cleaning`."""
+    """Say which Gaussians an option takes away. `option` is the name of a field of `Cleaning`."""
     if option == "crop":
         return "outside the box"
     if option == "max_extent":

@@ -85,12 +85,12 @@ def _row_between_steps(when: str, before: int, after: int) -> str:
 
 
 def nearest_view(poses: Tensor, pose: Tensor, extent: float) -> int:
-    """Return the index of the pose nearest to a given one; a distance of `extent` counts as much as 1 rad.
+    """Return the index of the pose nearest to a given one in position and viewing direction.
 
     Args:
         poses: Camera to world. [C, 3, 4]
         pose: Camera to world. [3, 4]
-        extent: In world units.
+        extent: Distance in world units that counts as much as an angle of 1 rad.
     """
     distances = (poses[:, :, 3] - pose[:, 3]).norm(dim=-1) / max(extent, 1e-12)  # [C]
     cosines = poses[:, :, 2] @ pose[:, 2]  # [C]

@@ -107,22 +107,35 @@ def _may_be_turned(image: images.Header) -> bool:
 def _problem(
     frame: images.Frame, image: images.Header, mask: images.Header | None, source: Path, nearby: NearbyFiles
 ) -> tuple[str, Path, str] | None:
-    """Return the problem of a frame's files, or None: its kind, the file and the rest of the sentence."""
+    """Return the kind of a problem, the file that has it, and the rest of a sentence; None if the files are good.
+
+    Problems of one kind are told in one sentence.
+
+    Args:
+        frame: The frame whose image and mask are checked.
+        image: The image's header.
+        mask: The mask's header, or None if the frame has no mask.
+        source: The file that the frame is from.
+        nearby: Finds the file that is meant by the name of a missing one.
+    """
     if image.problem.startswith("does not exist"):
-        found = nearby.sentence(frame.image)
-        if found is not None:
-            return "near", frame.image, found
+        sentence = nearby.sentence(frame.image)
+        if sentence is not None:
+            return "near", frame.image, sentence
     if image.problem:
-        return image.problem.split(" (")[0], frame.image, image.problem
+        kind = image.problem.split(" (")[0]  # Details follow in brackets.
+        return kind, frame.image, image.problem
     if image.mode not in ("RGB", "RGBA", "L"):
         return "mode", frame.image, f"has pixels of Pillow's mode {image.mode}: convert it to 8-bit RGB"
-    if min(image.size) < 2:
-        return "small", frame.image, "has {} × {} px: leave it out of the reconstruction".format(*image.size)
-    if frame.size not in (None, image.size):
-        sizes = "{} × {} px, but its camera in {} {} × {}".format(*image.size, source, *frame.size)
-        if image.orientation in images.SIDEWAYS and frame.size == image.size[::-1]:
-            sizes = f"EXIF orientation {image.orientation} and is read as {sizes}: {_TURN}"
-            return "orientation", frame.image, f"has {sizes}"
+    width, height = image.size
+    if min(width, height) < 2:
+        return "small", frame.image, f"has {width} × {height} px: leave it out of the reconstruction"
+    if frame.size is not None and frame.size != image.size:
+        camera_width, camera_height = frame.size
+        sizes = f"{width} × {height} px, but its camera in {source} {camera_width} × {camera_height}"
+        if image.orientation in images.SIDEWAYS and frame.size == (height, width):
+            orientation = f"EXIF orientation {image.orientation}"
+            return "orientation", frame.image, f"has {orientation} and is read as {sizes}: {_TURN}"
         return "size", frame.image, f"has {sizes}: use the images that the poses were computed from"
     if frame.mask is None or mask is None:
         return None
@@ -134,11 +147,12 @@ def _mask_problem(
 ) -> tuple[str, Path, str] | None:
     """Return the problem of the mask of a good image, as `_problem` does."""
     if mask.problem.startswith("does not exist"):
-        found = nearby.sentence(path)
-        if found is not None:
-            return "near mask", path, found
+        sentence = nearby.sentence(path)
+        if sentence is not None:
+            return "near mask", path, sentence
     if mask.problem:
-        return mask.problem.split(" (")[0], path, mask.problem
+        kind = mask.problem.split(" (")[0]
+        return kind, path, mask.problem
     if mask.mode not in images.GREY_MODES:
         return "mask mode", path, f"is a mask of Pillow's mode {mask.mode}: convert it to 8-bit grey"
     if mask.size != image.size:
