@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from typing import Any
 
 import torch
@@ -39,6 +40,7 @@ class CleaningPanel(torch.nn.Module):
         self._visibility: Visibility | None = None
         self._measured_at: tuple[int, int] | None = None  # Number of Gaussians and iteration of `_visibility`
         self._stays = torch.ones(0, dtype=torch.bool)  # Which Gaussians stay. [N]
+        self._means: weakref.ref[Tensor] | None = None  # The parameter of the Gaussians that `_stays` is of
         self._shown = OFF
         self._text = ""
         self.choice = ViewerDropdown(
@@ -105,6 +107,7 @@ class CleaningPanel(torch.nn.Module):
         remaining = choose_remaining(params, cleaning, self._visibility)
         stays = remaining.stays
         self._stays = stays
+        self._means = weakref.ref(params["means"])
         self._shown = self.choice.value
         sentences = removal_sentences(cleaning, remaining)
         sentences.append(f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay.")
@@ -129,14 +132,20 @@ class CleaningPanel(torch.nn.Module):
         self._text = text
         self.text.refresh()
 
+    def _is_outdated(self) -> bool:
+        """Tell whether `_stays` is of other Gaussians than the model's. Densification replaces the parameters."""
+        means = self._run.model.gauss_params["means"]
+        if self._means is None or self._means() is not means:
+            return True
+        return len(self._stays) != len(means)
+
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return `cleaned`, a picture of the Gaussians that stay or go. [H, W, 3] in [0, 1]
 
         It is `rgb` if the preview is off, and after densification, which changes the Gaussians.
         """
         model = self._run.model
-        is_outdated = len(self._stays) != model.num_points
-        if self._shown == OFF or is_outdated:
+        if self._shown == OFF or self._is_outdated():
             return {OUTPUT: rendered["rgb"]}
         if self._shown == STAYS:
             chosen = self._stays

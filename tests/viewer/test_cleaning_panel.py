@@ -15,6 +15,7 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from helpers.kill_and_resume import set_up
 from helpers.short_runs import in_the_viewer
 from sadgs_ns.geometry.cleaning import Cleaning, choose_remaining, measure_visibility
+from sadgs_ns.method.ops import update_param_with_optimizer
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.viewer.cleaning_panel import GOES, OUTPUT, STAYS, CleaningPanel, command_line_options
@@ -77,6 +78,22 @@ def test_the_preview_draws_what_stays_and_what_goes_and_takes_nothing(pipeline: 
     again, picture = shown(pipeline)
     assert torch.equal(again, kept), "a model of these alone draws the same"
     assert torch.equal(again, picture), "of other Gaussians than were looked at, nothing is hidden"
+
+
+@torch.no_grad()
+def test_nothing_is_hidden_once_densification_replaced_gaussians_by_as_many(pipeline: SadgsPipeline):
+    model = pipeline.model
+    middle = float(model.means[:, 0].median())
+    set_to(pipeline.cleaning, crop_from=(middle, -100.0, -100.0), choice=STAYS)
+    rgb, picture = shown(pipeline)
+    assert not torch.equal(rgb, picture)
+
+    def flipped(_: str, value: torch.Tensor) -> torch.Tensor:
+        return value.flip(0)
+
+    update_param_with_optimizer(flipped, flipped, model.gauss_params, {})
+    rgb, picture = shown(pipeline)
+    assert torch.equal(rgb, picture)
 
 
 def test_what_views_see_is_measured_once_and_again_when_training_went_on(
