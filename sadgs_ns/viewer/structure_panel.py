@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -108,6 +109,7 @@ class StructurePanel(torch.nn.Module):
         super().__init__()
         self._run = run
         self._observed: dict[str, Tensor] = {}  # Statistics from `observe_now`
+        self._means: weakref.ref[Tensor] | None = None  # The parameter of the Gaussians that `_observed` is of
         self._refreshed = 0.0  # Time of the last `refresh`
         self._status = ""  # Text above the table
         self._shown = OFF  # Choice that `outputs` draws
@@ -192,6 +194,9 @@ class StructurePanel(torch.nn.Module):
         running = model.strategy_state.get("n_total")  # The run drops its statistics when densification ends. [N]
         if running is not None and len(running) == model.num_points and bool((running > 0).any()):
             return model.strategy_state
+        means = model.gauss_params["means"]  # Densification replaces this parameter.
+        if self._means is None or self._means() is not means:
+            return None
         observed = self._observed.get("n_total")  # [N]
         if observed is not None and len(observed) == model.num_points:
             return self._observed
@@ -202,7 +207,9 @@ class StructurePanel(torch.nn.Module):
         self._disable_button(True)
         try:
             self._read_photos()
+            means = weakref.ref(self._run.model.gauss_params["means"])
             self._observed = self._run.observe(self._with_progress)
+            self._means = means
         finally:
             self._disable_button(False)
         num_views = len(self._run.datamanager.train_dataset)

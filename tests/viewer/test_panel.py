@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import torch
 
 from helpers.kill_and_resume import set_up
+from sadgs_ns.method.ops import update_param_with_optimizer
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
@@ -105,6 +107,18 @@ def test_observing_all_training_views_tells_how_far_it_is_and_what_was_seen(
     panel.choice.value = "wavelength of the nearest photo"
     panel.choice.cb_hook(panel.choice)
     assert "Observed" not in panel.table.gui_handle.shown[-1], "it is not said for ever"
+
+
+def test_what_was_observed_does_not_count_once_densification_replaced_gaussians_by_as_many(pipeline: SadgsPipeline):
+    panel = pipeline.structure
+    panel.observe.cb_hook(panel.observe)
+    assert panel.statistics() is not None
+
+    def flipped(_: str, value: torch.Tensor) -> torch.Tensor:
+        return value.flip(0)
+
+    update_param_with_optimizer(flipped, flipped, pipeline.model.gauss_params, {})
+    assert panel.statistics() is None
 
 
 @pytest.mark.hard_case("the panel fails, as with full memory", "told in the panel as well as in the terminal")
