@@ -302,7 +302,7 @@ def _segment_gradients(
     dots = v_colors @ colors.mT  # [B, S * S, L]
     # The colour that each Gaussian adds to the pixel, dotted with v_colors; the last entry is all behind the segment.
     added = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)  # [B, S * S, L + 1]
-    from_behind = added.flip(-1).cumsum(dim=-1).flip(-1)  # The sum of each entry and those behind it
+    from_behind = added.flip(-1).cumsum(dim=-1).flip(-1)  # Each entry and those behind it. [B, S * S, L + 1]
     hidden = from_behind[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
     v_alphas = dots.view_as(alphas) * segment.transmittances[..., :-1]
     v_alphas.sub_(hidden)

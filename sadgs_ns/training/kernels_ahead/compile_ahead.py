@@ -74,7 +74,8 @@ def wait() -> None:
 def _marker() -> Path | None:
     """Return the file in Triton's cache that exists once the kernels are compiled; this imports no torch.
 
-    None if they should not be compiled ahead: without an NVIDIA card, with few cores, or without torch or Triton.
+    None if they should not be compiled ahead: without an NVIDIA card, torch or Triton, with few cores, or if
+    `SADGS_TRITON=0` turns the kernels off.
     """
     models = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
     if not models or num_cores() < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
