@@ -14,14 +14,22 @@ _DIGITS = ((20, 11), (10, 10), (0, 10))  # Shifts and widths of the parts of a p
 def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) -> Tensor:
     """Choose which Gaussians may grow so that the hard cap holds, those of the largest priority first.
 
-    Each one is taken if it fits into the budget that those before it left; of equal priorities the first come first, in
-    the order of the ranks. One that does not fit is passed over: otherwise a single parent of 512 children would block
-    all others near the cap. Instead of a sort, histograms of the priorities, summed over the processes, find the first
-    Gaussian that does not fit, and then the first of smaller ones; that takes less time, in one process, too.
+    Each one is taken if it fits into the budget that those before it left. Equal priorities are taken in the order of
+    the ranks and their rows. A Gaussian that does not fit is passed over: otherwise a single parent of 512 children
+    would block all others near the cap.
 
-    `growth` is the number of Gaussians that each one of this process would add, ≥ 0, int64 [N], and its `priority` is
-    ≥ 0 [N]. `budget` is the number that may be added in all, the same in all processes; ≤ 0 allows none. Gaussians that
-    would add none are never chosen. bool [N]
+    Each round takes the Gaussians before the first that does not fit. The next round leaves out all that would add more
+    than the budget that is left. Histograms of the priorities, summed over the processes, find the first that does not
+    fit. They take less time than a sort, in one process, too.
+
+    Args:
+        world: The processes, which call this together.
+        growth: The number of Gaussians that each one of this process would add, ≥ 0. int64 [N]
+        priority: ≥ 0. [N]
+        budget: The number that may be added in all, the same in all processes; ≤ 0 allows none.
+
+    Returns:
+        Whether each Gaussian may grow, False if it would add none. bool [N]
     """
     # The bits of floats that are not negative have the order of the floats.
     bits = priority.float().contiguous().view(torch.int32)
@@ -39,9 +47,9 @@ def limit_growth(world: World, growth: Tensor, priority: Tensor, budget: float) 
 
 
 def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, budget: float) -> Tensor:
-    """Choose by priority all Gaussians before the first that does not fit; all together do not. bool [N]"""
+    """Choose by priority all Gaussians before the first that exceeds the budget, which must exist. bool [N]"""
     equal = growth > 0  # These agree in the digits so far with the first that does not fit.
-    before = 0
+    growth_before = 0  # By Gaussians whose priority is surely larger
     threshold = 0
     for shift, width in _DIGITS:
         largest = (1 << width) - 1
@@ -50,14 +58,14 @@ def _up_to_first_that_does_not_fit(world: World, growth: Tensor, bits: Tensor, b
         histogram = growth.new_zeros(1 << width)
         histogram.scatter_add_(0, digits, growth_of_equal)
         from_top = world.sum(histogram).flip(0).cumsum(0)  # It grows as the digit falls.
-        index = int((before + from_top <= budget).sum())
+        index = int((growth_before + from_top <= budget).sum())
         if index > 0:
-            before += int(from_top[index - 1])
+            growth_before += int(from_top[index - 1])
         digit = largest - index
         equal &= digits == digit
         threshold |= digit << shift
     ties = torch.where(equal, growth, 0)
     totals = world.gather(ties.sum()[None])[:, 0]  # [R]
-    before += int(totals[: world.rank].sum())
-    ties_that_fit = equal & (before + ties.cumsum(0) <= budget)
+    growth_before += int(totals[: world.rank].sum())
+    ties_that_fit = equal & (growth_before + ties.cumsum(0) <= budget)
     return (growth > 0) & ((bits > threshold) | ties_that_fit)

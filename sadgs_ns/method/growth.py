@@ -85,8 +85,8 @@ class Rule:
 def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Split the axes on which η violated consistently (paper, section 3.5).
 
-    An axis needs about √η children. A Gaussian's priority is the sum of these numbers over the axes that are split,
-    divided by the number of Gaussians that the split adds.
+    An axis needs about √η children. A Gaussian's priority is the sum of √η over the axes that are split, divided by the
+    number of Gaussians that the split adds.
     """
     violates = consistent(state["n_high"], state["n_total"], options.tau_split, options.min_observations)  # [N, 3]
     is_opaque = opacities(params) >= options.split_min_opacity  # [N]
@@ -96,14 +96,16 @@ def structure_aware(options: Options, params: Params, state: Mapping[str, Any]) 
     needed = torch.where(counts > 1, eta_max.sqrt(), 0.0).sum(dim=1)  # [N]
     added = num_children(counts) - 1  # [N]
     split_into_grid = partial(grid_split, child_scale=options.child_scale)
-    return Proposal(counts, needed / added.clamp_min(1), split_into_grid)
+    priority = needed / added.clamp_min(1)
+    return Proposal(counts, priority, split_into_grid)
 
 
 def absgs(options: Options, params: Params, state: Mapping[str, Any]) -> Proposal:
     """Clone small Gaussians by their mean gradient, split large ones in two by their absolute gradient.
 
-    The steepest come first. A large one's longest axis is halved in its place; without `absgs_long_axis`, the places of
-    two that are 1.6 times as small on all axes are drawn at random, as 3DGS does.
+    Those with the largest gradients, relative to the thresholds, come first. A large one is halved along its longest
+    axis. Without `absgs_long_axis` two Gaussians, 1.6 times as small on all axes, take its place; their centres are
+    drawn at random, as in 3DGS.
     """
     is_small, steepness = _steepness(options, params, state)
     grows = (steepness >= 1) & steepness.isfinite()  # A sum that overflowed says nothing.
@@ -129,19 +131,21 @@ def _steepness(options: Options, params: Params, state: Mapping[str, Any]) -> tu
 
 
 def refill(options: Options, params: Params, state: Mapping[str, Any], share: float) -> Proposal:
-    """Let all Gaussians grow as AbsGS does, so that their number can grow by a share.
+    """Let all Gaussians grow as AbsGS does, so that their number can grow by a share of itself.
 
-    The steepest come first, and among those without gradients, the largest η. Up to a share of 1 they are halved, and
-    above, they are cut into more parts along the longest axis.
+    Those with the largest gradients come first, and among those without gradients, those with the largest η. Up to a
+    share of 1, small Gaussians are cloned and large ones are halved along their longest axis. Above it, all are cut
+    into more than two parts along that axis.
     """
     is_small, steepness = _steepness(options, params, state)
     parts = min(1 + math.ceil(share), MAX_CHILDREN_PER_AXIS)
     is_cloned = is_small & (parts == 2)
     longest = F.one_hot(params["scales"].detach().argmax(dim=-1), 3)  # [N, 3]
     added = (parts - 1) * longest * ~is_cloned[:, None]
+    by_gradient = torch.nan_to_num(steepness, nan=0.0, posinf=0.0)
     by_eta = FAINT_NEED * state["eta_max"].amax(dim=1)
-    need = torch.nan_to_num(steepness, nan=0.0, posinf=0.0)
-    return Proposal(1 + added, torch.maximum(need, by_eta), _halve, clone=is_cloned)
+    priority = torch.maximum(by_gradient, by_eta)
+    return Proposal(1 + added, priority, _halve, clone=is_cloned)
 
 
 RULES: dict[str, Rule] = {
@@ -152,7 +156,7 @@ RULES: dict[str, Rule] = {
 
 
 def rivals(rule: Rule) -> list[Rule]:
-    """Return the rules that are ranked together with one where not all of its proposal fits.
+    """Return the rules that are ranked together with a rule if not all of its proposal fits.
 
     Those are the rules that read the other part of the state, which is then kept, too.
     """
@@ -207,18 +211,19 @@ def apply_best(
     state: State,
 ) -> None:
     """Let the `allowed` Gaussians grow, each as its `chosen` proposal says, in place."""
-    # Rows of the state move with their Gaussians, and those of new ones are empty.
+    # Each proposal that is applied moves Gaussians to other rows and adds new ones. The state's rows move with them, so
+    # the later proposals wait in the state. New Gaussians get zeros there, which must mean that they do not grow.
     for index, proposal in enumerate(proposals):
-        is_next = allowed & (chosen == index)
-        state[f"pending {index}"] = is_next
-        state[f"children {index}"] = proposal.children - 1
+        state[f"grows {index}"] = allowed & (chosen == index)
+        state[f"children besides one {index}"] = proposal.children - 1
         if proposal.clone is not None:
             state[f"clone {index}"] = proposal.clone
     for index, proposal in enumerate(proposals):
-        children = state.pop(f"children {index}") + 1
+        grows = state.pop(f"grows {index}")
+        children = state.pop(f"children besides one {index}") + 1
         clone = state.pop(f"clone {index}", None)
-        is_next = state.pop(f"pending {index}")
-        apply(replace(proposal, children=children, clone=clone), is_next, params, optimizers, state)
+        moved = replace(proposal, children=children, clone=clone)
+        apply(moved, grows, params, optimizers, state)
 
 
 def _clone(is_cloned: Tensor, params: Any, optimizers: Any, state: Any) -> int:

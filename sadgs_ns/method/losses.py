@@ -102,16 +102,16 @@ def photometric_part(
     height: int,
     ssim_lambda: float = 0.2,
 ) -> tuple[Tensor, Tensor]:
-    """The part of a view's `photometric_loss` that some rows contribute; the parts of all rows sum to the loss.
+    """Compute the part of a view's `photometric_loss` that some rows contribute; the parts of all rows sum to it.
 
     SSIM's windows belong to the rows in which they are centred. Raises ValueError as `photometric_loss`.
 
     Args:
-        predicted: Rendered rows from `top` on, 5 more than `rows` on either side but at image borders. [1, H', W, 3]
+        predicted: The rendering of `rows` and of 5 more on either side, as far as the image reaches. [1, H', W, 3]
         target: The same rows of the training view.
         rows: First row that counts and one past the last.
-        top: Which row of the view is the first of `predicted`.
-        height: Of the view in px, at least 11 unless all rows count.
+        top: The view's row that is the first of `predicted`.
+        height: The view's in px, at least 11 unless all rows count.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
@@ -125,14 +125,14 @@ def photometric_part(
     begin = max(first - reach, 0)
     end = min(last + reach, height)
     share_of_windows = (end - begin - 2 * reach) / (height - 2 * reach)
-    reached = slice(begin - top, end - top)
-    dissimilarity, _ = photometric_loss(predicted[:, reached], target[:, reached], ssim_lambda=1.0, l2_lambda=0.0)
-    # The other two terms of these rows, and their share of all rows.
-    share = (last - first) / height
-    counted = slice(first - top, last - top)
-    difference = predicted[:, counted] - _as_floats(target[:, counted])
+    in_windows = slice(begin - top, end - top)
+    dissimilarity, _ = photometric_loss(predicted[:, in_windows], target[:, in_windows], ssim_lambda=1.0, l2_lambda=0.0)
+    # L1 and L2 of these rows, and their share of all rows.
+    share_of_rows = (last - first) / height
+    own = slice(first - top, last - top)
+    difference = predicted[:, own] - _as_floats(target[:, own])
     l1 = difference.abs().mean()
     l2 = difference.square().mean()
     of_pixels = (1 - ssim_lambda) * l1 + L2_LAMBDA * l2
-    loss = share * of_pixels + share_of_windows * ssim_lambda * dissimilarity
-    return loss, share * l2.detach()
+    loss = share_of_rows * of_pixels + share_of_windows * ssim_lambda * dissimilarity
+    return loss, share_of_rows * l2.detach()

@@ -206,12 +206,12 @@ class RunningStrategy(Strategy):
             rebalance(self.world, params, optimizers, state)
 
     def _resets(self, iteration: int) -> bool:
-        """Tell whether opacities are reset; just before the final prune that would leave no time to recover."""
+        """Tell whether an iteration resets opacities; none does so late that the final prune would take them."""
         every = self.windows.reset_every
         if not due(iteration, every):
             return False
-        latest = self.windows.refine_stop_iter - every // 4
-        return iteration <= latest
+        latest_reset = self.windows.refine_stop_iter - every // 4
+        return iteration <= latest_reset
 
     def prune_haze(self, params: Params, optimizers: Optimizers, state: State) -> None:
         """Remove the haze near the state's `camera_paths`, which also arises after the last densification step."""
@@ -265,7 +265,7 @@ class RunningStrategy(Strategy):
         """Let Gaussians grow by rules that do not read η, prune the faint, and empty the gradients that were read."""
         self._grow(rules, params, optimizers, state, iteration, views)
         self._prune(params, optimizers, state, self.options.min_opacity)
-        # At the end, what fills the cap reads the gradients, too.
+        # The last step keeps them for `_refill`, which reads them, too.
         was_read = any(rule.reads == "gradients" for rule in rules)
         if was_read and iteration < self.windows.refine_stop_iter:
             state.update(empty_gradients(len(params["means"]), params["means"].device))

@@ -21,9 +21,10 @@ def empty_gradients(num_gaussians: int, device: torch.device) -> dict[str, Tenso
 def keep_gradient(
     means2d: Tensor,  # [C, N, 2]
 ) -> None:
-    """Let the backward pass keep the gradient of projected centres, given `info` of a call with `absgrad`.
+    """Let the backward pass keep the gradient of projected centres.
 
-    Our compositing keeps it by itself, without the copy that torch makes.
+    They are `means2d` of the info of a rendering with `absgrad`. Compositing by Triton stores the gradient in their
+    `grad2d` itself, without the copy that torch's `retain_grad` makes.
     """
     if not hasattr(means2d, "grad2d"):
         means2d.retain_grad()

@@ -26,7 +26,7 @@ INTEGRATION_FACTOR = 3.0
 GAMMA = 3.0
 """γ, the exponent of the scale weights E_l^γ (paper, eq. 5)."""
 FREQUENCY_CONSTANT = 0.75
-"""c of ω_l = c / σ_l, in 1/px, which the paper leaves open (docs/results.md#why-these-defaults)."""
+"""c of ω_l = c / σ_l, a number without a unit, which the paper leaves open (docs/results.md#why-these-defaults)."""
 NOISE_FLOOR = 0.02
 """Amplitude, relative to the image's own contrast, under which structure counts as noise: the ε of eq. 3 and 5."""
 ENERGY_BLUR = 2.0
@@ -80,7 +80,9 @@ def multiscale_structure_tensor(
     Args:
         images: Linear in pixel values, any range ≥ 0, any floating dtype (computed in at least float32). [B, H, W, C]
         masks: Valid pixels, or None for all; others, even NaN, neither contribute nor receive a tensor. bool [B, H, W]
-        frequency_constant: See FREQUENCY_CONSTANT; `noise_floor` and `energy_blur` have constants, too.
+        frequency_constant: See FREQUENCY_CONSTANT.
+        noise_floor: See NOISE_FLOOR.
+        energy_blur: See ENERGY_BLUR.
         epsilon: ε > 0 of eq. 3 and 5 as the paper prints it, the same number for every image and level, in the units
             of the pixel values; the released code takes 1e-6 with values in [0, 1]. `noise_floor` then has no effect.
         known_finite: The valid pixels are known to be finite; otherwise the host waits for the device to find out.
@@ -91,7 +93,7 @@ def multiscale_structure_tensor(
     Raises:
         ValueError: If the images or masks have another shape, the images are empty or not floating point, a valid
             pixel is NaN or infinite, or `epsilon` is not positive.
-        InputError: If the images are larger, or more, than the Triton kernels can address (kernels/limits.py).
+        InputError: If the images are too large, or too many, for the Triton kernels to address (kernels/limits.py).
     """
     if epsilon is not None and not epsilon > 0:
         raise ValueError(f"epsilon must be positive, or None for one relative to the contrast, got {epsilon:g}")
@@ -225,9 +227,9 @@ def _normalise(
     """Scale and centre the valid pixels of each image.
 
     Returns:
-        The images in [−1, 1] around a mean of 0, 0 where masked [B, C, H, W]; the largest absolute value, by which they
-        were divided [B, 1, 1, 1]; and their contrast after that, the root of the mean squared distance from the mean
-        colour [B, 1, 1, 1].
+        The images divided by their largest absolute value, around a mean of 0, and 0 where masked [B, C, H, W]; that
+        largest value [B, 1, 1, 1]; and their contrast after the division, the root of the mean squared distance from
+        the mean colour [B, 1, 1, 1].
     """
     brightest = image.abs().amax(dim=(1, 2, 3), keepdim=True).clamp_min(torch.finfo(image.dtype).tiny)
     image = image / brightest  # HDR and tiny exposures then behave alike.
@@ -251,16 +253,17 @@ class _WeightedSums:
 
     def blur(self, image: Tensor, sigma: float) -> Tensor:
         """Separable Gaussian blur. [B, C, H, W] → [B, C, H, W]"""
-        return self._along(self._along(image, sigma, 0, 2), sigma, 0, 3)
+        down = self._along(image, sigma, order=0, axis=2)
+        return self._along(down, sigma, order=0, axis=3)
 
     def blur_and_gradient(self, image: Tensor, sigma: float) -> tuple[Tensor, Tensor, Tensor]:
         """Gaussian blur, and its exact x and y derivatives per px. [B, C, H, W] → each [B, C, H, W]"""
-        down = self._along(image, sigma, 0, 2)
-        derived_down = self._along(image, sigma, 1, 2)
-        blurred = self._along(down, sigma, 0, 3)
-        along_x = self._along(down, sigma, 1, 3)
-        along_y = self._along(derived_down, sigma, 0, 3)
-        return blurred, along_x, along_y
+        down = self._along(image, sigma, order=0, axis=2)
+        derived_down = self._along(image, sigma, order=1, axis=2)
+        blurred = self._along(down, sigma, order=0, axis=3)
+        derivative_x = self._along(down, sigma, order=1, axis=3)
+        derivative_y = self._along(derived_down, sigma, order=0, axis=3)
+        return blurred, derivative_x, derivative_y
 
     def total(self, sigma: float) -> Tensor:
         """`blur` of the weights, positive. [1 or B, 1, H, W]"""
@@ -272,20 +275,20 @@ class _WeightedSums:
         if self.masked:
             total, total_x, total_y = self.blur_and_gradient(self.weight, sigma)
         else:
-            total = self._unmasked(sigma, 0, 0)
-            total_x = self._unmasked(sigma, 1, 0)
-            total_y = self._unmasked(sigma, 0, 1)
+            total = self._unmasked(sigma, order_x=0, order_y=0)
+            total_x = self._unmasked(sigma, order_x=1, order_y=0)
+            total_y = self._unmasked(sigma, order_x=0, order_y=1)
         return total.clamp_min(torch.finfo(total.dtype).tiny), total_x, total_y
 
     def _blurred_weight(self, sigma: float) -> Tensor:
         if self.masked:
             return self.blur(self.weight, sigma)
-        return self._unmasked(sigma, 0, 0)
+        return self._unmasked(sigma, order_x=0, order_y=0)
 
     def _unmasked(self, sigma: float, order_x: int, order_y: int) -> Tensor:
-        """Blur of ones or its derivative, as the product of those of a column and of a row of ones. [1, 1, H, W]"""
-        column = self._along(self.weight[..., :1], sigma, order_y, 2)
-        row = self._along(self.weight[..., :1, :], sigma, order_x, 3)
+        """Blur ones, or take a derivative of that: the product of a blurred column and a blurred row. [1, 1, H, W]"""
+        column = self._along(self.weight[..., :1], sigma, order_y, axis=2)
+        row = self._along(self.weight[..., :1, :], sigma, order_x, axis=3)
         return column * row
 
     def _along(self, image: Tensor, sigma: float, order: int, axis: int) -> Tensor:

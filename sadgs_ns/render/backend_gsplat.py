@@ -51,7 +51,7 @@ def colors_in_views(
 
 
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
+    """Composite as `rasterization.composite` does, without expected depth; the last result goes into its info."""
     radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
     columns = -(-width // TILE_SIZE)
     rows = -(-height // TILE_SIZE)

@@ -71,7 +71,7 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions, begi
 
 
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info."""
+    """Composite as `rasterization.composite` does, without expected depth; the last result goes into its info."""
     radii, means2d, depths, conics, opacities, colors, width, height, _ = projected
     C = len(means2d)
     if radii.dim() < means2d.dim():
@@ -291,7 +291,8 @@ def _segment_gradients(
 ) -> tuple[Tensor, Tensor]:
     """Return gradients [B * L, 6 + D (+ 2)] of means2d, conics, opacity, colours (and absgrad), and a new `behind`.
 
-    The new `behind` is for the segment before this one: it includes this segment.
+    The new `behind` is for the segment before this one: it includes this segment. `v_name` is the gradient of the loss
+    by `name`.
     """
     dx = segment.dx
     dy = segment.dy
@@ -299,9 +300,9 @@ def _segment_gradients(
     weights = segment.weights
     a, b, c = segment.conics
     dots = v_colors @ colors.mT  # [B, S * S, L]
-    # What each Gaussian adds to the pixel, and last what is behind the segment, dotted with v_colors.
+    # The colour that each Gaussian adds to the pixel, dotted with v_colors; the last entry is all behind the segment.
     added = torch.cat([weights.flatten(1, 2) * dots, behind], dim=-1)  # [B, S * S, L + 1]
-    from_behind = added.flip(-1).cumsum(dim=-1).flip(-1)  # Sums of an entry and all behind it. [B, S * S, L + 1]
+    from_behind = added.flip(-1).cumsum(dim=-1).flip(-1)  # Each entry and those behind it. [B, S * S, L + 1]
     hidden = from_behind[..., 1:].reshape_as(alphas).div_(1.0 - alphas)
     v_alphas = dots.view_as(alphas) * segment.transmittances[..., :-1]
     v_alphas.sub_(hidden)
@@ -309,7 +310,8 @@ def _segment_gradients(
     # Nothing flows through a Gaussian that is not drawn or whose alpha is cut off at the top.
     has_no_gradient = (weights == 0) | (alphas >= _MAX_ALPHA)
     v_sigmas.masked_fill_(has_no_gradient, 0.0)
-    # Moments over the pixels. dx depends on the column and dy on the row only: the other axis is summed first.
+    # Sums of v_sigmas over the pixels, times dx (mx), dy (my) and their products (mxx, mxy, myy). dx depends on the
+    # column only and dy on the row only, so that the other axis is summed first.
     column_sums = v_sigmas.sum(dim=1, keepdim=True)  # [B, 1, S, L]
     row_sums = v_sigmas.sum(dim=2, keepdim=True)  # [B, S, 1, L]
     row_sums_x = (v_sigmas * dx).sum(dim=2, keepdim=True)  # [B, S, 1, L]

@@ -65,7 +65,7 @@ def _colors_in_views(gaussians: Gaussians, viewmats: Tensor, sh_degree: int | No
 
 
 def composite(projected: Projected, options: RenderOptions) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Do what `rasterization.composite` says, but for the depth; the last result is what it adds to the info.
+    """Composite as `rasterization.composite` does, without expected depth; the last result goes into its info.
 
     With `options.tile_capacity`, the tile lists have one more row of tiles than the image (`PendingTiles.lists`).
     """

@@ -35,8 +35,7 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     """
     x, y, z = means.unbind(dim=-1)
     z2 = z**2
-    # [C, 1]
-    fx = Ks[:, 0, 0, None]
+    fx = Ks[:, 0, 0, None]  # [C, 1], like the next ones
     fy = Ks[:, 1, 1, None]
     cx = Ks[:, 0, 2, None]
     cy = Ks[:, 1, 2, None]
@@ -46,10 +45,11 @@ def perspective(means: Tensor, covars: Tensor, Ks: Tensor, width: int, height: i
     right = (width - cx) / fx + margin_x
     top = -(cy / fy + margin_y)
     bottom = (height - cy) / fy + margin_y
-    x = z * torch.clamp(x / z, min=left, max=right)
-    y = z * torch.clamp(y / z, min=top, max=bottom)
+    # The Jacobian is taken at a place near the image; the centres stay where they are.
+    clamped_x = z * torch.clamp(x / z, min=left, max=right)
+    clamped_y = z * torch.clamp(y / z, min=top, max=bottom)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * x / z2, zero, fy / z, -fy * y / z2], dim=-1)
+    jacobian = torch.stack([fx / z, zero, -fx * clamped_x / z2, zero, fy / z, -fy * clamped_y / z2], dim=-1)
     jacobian = jacobian.reshape(*z.shape, 2, 3)
     covars2d = torch.einsum("...ij,...jk,...kl->...il", jacobian, covars, jacobian.transpose(-1, -2))
     means2d = torch.einsum("cij,cnj->cni", Ks[:, :2, :3], means)

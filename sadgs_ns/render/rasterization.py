@@ -113,7 +113,7 @@ def visible(info: Mapping[str, Any]) -> Tensor:
 def viewmats_from_camera_to_world(
     camera_to_worlds: Tensor,  # [C, 3, 4]
 ) -> Tensor:
-    """Make `Cameras.viewmats` from nerfstudio's poses, orthonormal in OpenGL's axes (x right, y up, z backward)."""
+    """Make `Cameras.viewmats` [C, 4, 4] of orthonormal poses in OpenGL's axes (x right, y up, z backward)."""
     flip = camera_to_worlds.new_tensor([1.0, -1.0, -1.0])
     rotations = (camera_to_worlds[:, :, :3] * flip).mT  # [C, 3, 3], the inverse of an orthonormal matrix
     translations = -rotations @ camera_to_worlds[:, :, 3:]  # [C, 3, 1]

@@ -144,10 +144,10 @@ def affordable_growth(params: Params, state: Mapping[str, Any], free: float, siz
     new_pairs = PAIRS_PER_GAUSSIAN * size.views
     growth = math.inf
     for phase in _phases(size, params["means"].device).values():
-        of_present = num_present * (phase.per_gaussian + widest)
-        left = free - of_present - phase.of_pixels - phase.per_pair * size.pairs
-        each = kept + widest + phase.per_gaussian + phase.per_pair * new_pairs
-        growth = min(growth, left / each)
+        bytes_of_present = num_present * (phase.per_gaussian + widest)
+        bytes_left = free - bytes_of_present - phase.of_pixels - phase.per_pair * size.pairs
+        bytes_of_new = kept + widest + phase.per_gaussian + phase.per_pair * new_pairs  # Of each new Gaussian
+        growth = min(growth, bytes_left / bytes_of_new)
     return max(math.floor(growth), 0)
 
 

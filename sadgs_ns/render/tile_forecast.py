@@ -69,9 +69,11 @@ class TileForecast:
     def capacity(self, views: Sequence[int], size: tuple[int, int], num_gaussians: int) -> int | None:
         """Predict how many places the tile lists of a call should have.
 
-        It is the sum over the views of the number at the last visit in this size, times the largest recent growth of
-        any view, times MARGIN, rounded up so that few different numbers occur. None means that the host must wait: a
-        view was never visited, no view was visited since a densification, or there are more than MOST_PAIRS.
+        It is the sum over the views of the number of pairs at the last visit in this size, times the largest recent
+        growth of any view, times MARGIN, rounded up so that few different numbers occur.
+
+        None means that the host must wait: a view was never visited, no view was visited since a densification, or
+        there are more than MOST_PAIRS.
         """
         if num_gaussians != self._num_gaussians:
             self._epoch += 1
@@ -85,7 +87,8 @@ class TileForecast:
             factors = [change.factor for change in self._changes if change.epoch <= visit.epoch]
             if visit.epoch < self._epoch and not factors:
                 return None
-            total += max([1.0, *factors]) * visit.num_pairs
+            largest_factor = max([1.0, *factors])
+            total += largest_factor * visit.num_pairs
         rounded = self._round_up(int(MARGIN * total) + 1)
         if rounded > MOST_PAIRS:
             return None

@@ -72,15 +72,19 @@ def wait() -> None:
 
 
 def _marker() -> Path | None:
-    """Return the file in Triton's cache that says that this was done, or None if it should not be; imports no torch."""
-    cards = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
-    if not cards or num_cores() < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
+    """Return the file in Triton's cache that exists once the kernels are compiled; this imports no torch.
+
+    None if they should not be compiled ahead: without an NVIDIA card, torch or Triton, with few cores, or if
+    `SADGS_TRITON=0` turns the kernels off.
+    """
+    models = [re.findall("Model:.*", path.read_text()) for path in sorted(_CARDS.glob("*/information"))]
+    if not models or num_cores() < _FEWEST_CORES or os.environ.get("SADGS_TRITON") == "0":
         return None
     try:
         versions = f"{version('torch')} {version('triton')} {sys.version}"
     except PackageNotFoundError:
         return None
-    key = f"{cards} {os.environ.get('CUDA_VISIBLE_DEVICES')} {versions}"
+    key = f"{models} {os.environ.get('CUDA_VISIBLE_DEVICES')} {versions}"
     digest = hashlib.sha256(key.encode())
     kernels = sorted((_HERE.parents[1] / "kernels").glob("*.py"))
     for path in (*kernels, _HERE / "probes.py", _HERE / "compile_ahead.py"):

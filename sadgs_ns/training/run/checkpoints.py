@@ -84,9 +84,9 @@ def checkpoint_paths(load_dir: Path | None, load_step: int | None, load_checkpoi
 
 
 def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
-    """Return the checkpoints of a run's folder, or of its folder of checkpoints, by their steps.
+    """Return the checkpoints in a run's folder, or in its folder of checkpoints, by their steps.
 
-    Raises InputError if there is none; the sentence names the latest run in the folders below.
+    Raises InputError if there is none. Its sentence names the latest run in the folders below, if there is one.
     """
     if (load_dir / _FOLDER).is_dir():
         load_dir = load_dir / _FOLDER
@@ -97,12 +97,12 @@ def _checkpoints_in(load_dir: Path) -> dict[int, Path]:
             paths[int(match[1])] = path
     if paths:
         return paths
-    below = []
+    folders_below = []
     for depth in ("*", "*/*", "*/*/*"):
-        below += load_dir.glob(f"{depth}/{_FOLDER}")
+        folders_below += load_dir.glob(f"{depth}/{_FOLDER}")
     example = ""
-    if below:
-        latest = max(below, key=lambda folder: folder.stat().st_mtime)
+    if folders_below:
+        latest = max(folders_below, key=lambda folder: folder.stat().st_mtime)
         example = f", such as {latest.parent}"
     raise InputError(f"{load_dir} holds no checkpoint: give --load-dir the folder of a run of sadgs{example}.")
 
@@ -145,7 +145,7 @@ def _map_tensors(values: dict[str, Any], change: Callable[[Tensor], Tensor]) -> 
     return changed
 
 
-def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
+def write(folder: Path, step: int, state: dict[str, Any], keep_others: bool) -> None:
     """Save a checkpoint whole, and delete the run's others unless they are to be kept. Raises WriteError."""
     path = folder / f"step-{step:09d}.ckpt"
     digits = 9 * "[0-9]"  # A copy that a user has made has another name, and is no checkpoint of the run.
@@ -158,7 +158,7 @@ def write(folder: Path, step: int, state: dict[str, Any], keep: bool) -> None:
         if others:  # The new checkpoint must survive a power cut before these are deleted.
             with partial.open("rb+") as file:
                 os.fsync(file.fileno())
-    if not keep:
+    if not keep_others:
         for other in others:
             other.unlink()
 

@@ -94,7 +94,7 @@ def import_nerfstudio() -> None:
 
 
 def _import_with_stand_ins(importer: str, names: Sequence[str]) -> None:
-    """Import a module while stand-ins have the places of others, by their names."""
+    """Import the module `importer` while stand-ins replace the modules `names` in `sys.modules`."""
     imported_before = {name: sys.modules[name] for name in names if name in sys.modules}
     for name in names:
         stand_in = StandIn(name, partial(import_module, name))

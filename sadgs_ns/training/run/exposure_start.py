@@ -95,10 +95,10 @@ def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
             stops[view] = before.stops[rows[name]]
             kept[view] = True
     points = before.points
-    observing = pipeline.point_observations("train")
-    if observing is not None:
-        observations = observing.of_all(pipeline.datamanager.cached_train)
-        num_points = len(observing.points)
+    point_observations = pipeline.point_observations("train")
+    if point_observations is not None:
+        observations = point_observations.of_all(pipeline.datamanager.cached_train)
+        num_points = len(point_observations.points)
         light = points_at_median(observations.of_views(kept), stops.numpy(), num_points)
         others, _ = gains_of_others(observations, light, len(names))
         stops = torch.where(torch.from_numpy(kept)[:, None], stops, torch.from_numpy(others))
@@ -112,23 +112,26 @@ def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
 
 
 def _find(pipeline: SadgsPipeline) -> _Found | None:
-    """Find gains by the points, or by EXIF if there are no points; None if there is neither."""
+    """Find gains by the points, or by EXIF if the points tell none; None if EXIF tells none, either."""
     files = pipeline.datamanager.train_dataset.image_filenames
-    tags = exposures_of(files)
-    observing = pipeline.point_observations("train")
-    if observing is not None:
-        observations = observing.of_all(pipeline.datamanager.cached_train)
-        fitted = fit_exposures(observations, len(files), len(observing.points))
+    exif_stops = exposures_of(files)
+    point_observations = pipeline.point_observations("train")
+    if point_observations is not None:
+        observations = point_observations.of_all(pipeline.datamanager.cached_train)
+        fitted = fit_exposures(observations, len(files), len(point_observations.points))
         if fitted.known.any():
-            if tags is not None:
-                _warn_of_disagreement(fitted, tags)
-            return _by_points(fitted, observations, observing.has_tracks)
-    if tags is None:
+            if exif_stops is not None:
+                _warn_of_disagreement(fitted, exif_stops)
+            return _by_points(fitted, observations, point_observations.has_tracks)
+    if exif_stops is None:
         return None
-    stops = np.array(tags) - np.median(tags)
-    used = bool(stops.std() >= LEAST_DEVIATION)
-    sentence = _sentence(float(stops.std()), float(np.ptp(stops)), "by EXIF", used)
-    return _Found(torch.from_numpy(stops)[:, None].repeat(1, 3), torch.zeros((0, 3)), None, used, sentence)
+    stops = np.array(exif_stops) - np.median(exif_stops)
+    deviation = float(stops.std())
+    used = deviation >= LEAST_DEVIATION
+    sentence = _sentence(deviation, float(np.ptp(stops)), "by EXIF", used)
+    stops_of_channels = torch.from_numpy(stops)[:, None].repeat(1, 3)  # [V, 3]
+    no_points = torch.zeros((0, 3))
+    return _Found(stops_of_channels, no_points, None, used, sentence)
 
 
 def _by_points(fitted: Exposures, observations: Observations, has_tracks: bool) -> _Found:
@@ -154,12 +157,12 @@ def _sentence(deviation: float, spread: float, source: str, used: bool) -> str:
     return f"{varies}, which is too little, or too unsure, for gains of their own."
 
 
-def _warn_of_disagreement(fitted: Exposures, tags: list[float]) -> None:
+def _warn_of_disagreement(fitted: Exposures, exif_stops: list[float]) -> None:
     """Print a line if EXIF's exposures have another range than the gains."""
-    known = np.array(tags)[fitted.known]
-    by_tags = float(np.ptp(known))
-    if abs(by_tags - fitted.spread) > _DISAGREEMENT:
+    known = np.array(exif_stops)[fitted.known]
+    exif_spread = float(np.ptp(known))
+    if abs(exif_spread - fitted.spread) > _DISAGREEMENT:
         warn(
-            f"By EXIF, exposure varies in a range of {by_tags:.1f} stops, but by the points' colours of "
+            f"By EXIF, exposure varies in a range of {exif_spread:.1f} stops, but by the points' colours of "
             f"{fitted.spread:.1f}: the points decide."
         )

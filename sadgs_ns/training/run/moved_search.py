@@ -139,9 +139,12 @@ class MovedSearch:
                 yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
 
     def _draw(self, gaussians: Gaussians, indices: Sequence[int]) -> tuple[Tensor, Tensor, Cameras]:
-        """Draw V views of one size at working size with their photos' gains; all processes have the whole pictures.
+        """Draw V views of one size, at working size and with the gains of their photos.
 
-        Returns colours in [0, 1] [V, 3, h, w], depths [V, h, w] and the small cameras.
+        All processes call this. Each draws some rows, and all get the whole pictures.
+
+        Returns:
+            Colours in [0, 1] [V, 3, h, w], depths [V, h, w], 0 where little is drawn, and the cameras at working size.
         """
         model = self._model
         world = model.strategy.world
@@ -151,27 +154,27 @@ class MovedSearch:
         scale = Ks.new_tensor([width / full_width, height / full_height, 1.0])
         cameras = Cameras(viewmats, Ks * scale[:, None], width, height)
         pictures, _ = rasterize(world, gaussians, cameras, model.color_options(expected_depth=True))
-        whole = viewmats.new_zeros((len(indices), height, width, 5))
+        canvas = viewmats.new_zeros((len(indices), height, width, 5))  # Colour, depth and alpha
         for band, rendered, opacity in pictures:
             joined = torch.cat([rendered, opacity], dim=-1)
             if band is None:
-                whole = joined
+                canvas = joined
             else:
                 rows = slice(band.first - band.top, band.last - band.top)
-                whole[band.view, band.first : band.last] = joined[0, rows]
-        world.sum(whole)
-        colors = whole[..., :3].contiguous()
-        alphas = whole[..., 4:].contiguous()
+                canvas[band.view, band.first : band.last] = joined[0, rows]
+        world.sum(canvas)
+        colors = canvas[..., :3].contiguous()
+        alphas = canvas[..., 4:].contiguous()
         view_ids = model.view_ids(indices)
         if model.has_view_colors and view_ids is not None:
             colors = correct_colors(colors, alphas, model.view_matrices(model.trained_params, view_ids))
         colors = model.before_background(colors, alphas, model.background).clamp(0, 1)
-        depths = torch.where(alphas[..., 0] > _COVERED, whole[..., 3], 0.0)
+        depths = torch.where(alphas[..., 0] > _COVERED, canvas[..., 3], 0.0)
         return colors.movedim(-1, 1), depths, cameras
 
     @torch.no_grad()
     def pictures(self, index: int) -> tuple[Tensor, Tensor]:
-        """Return the photo of a view and its rendering, which this process draws alone, at working size. [3, h, w]"""
+        """Return the photo of a view and its rendering at working size; all processes call this. [3, h, w] each"""
         gaussians, _ = self._model.gaussians()
         colors, _, cameras = self._draw(gaussians, [index])
         data = self._views.datamanager.cached_train[index]
@@ -201,7 +204,7 @@ class MovedSearch:
         return shared
 
     def evidence(self) -> Verdict:
-        """Return what speaks for things that moved by the present Gaussians, without leaving anything out."""
+        """Judge all training views by the present Gaussians, and return the verdict without leaving anything out."""
         return verdict(self._small_views())
 
     def report(self, folder: Path) -> None:
@@ -226,7 +229,7 @@ class MovedSearch:
         root = common_folder(files)
         images = self._views.datamanager.cached_train
         for view in self._views.moved.views:
-            data = self._views.moved.applied(view, images[view])
+            data = self._views.moved.masked(view, images[view])
             # A picture of one bit takes a hundredth of the time.
             picture = Image.fromarray(data["mask"][..., 0].cpu().numpy())
             name = files[view].relative_to(root).with_suffix(".png")

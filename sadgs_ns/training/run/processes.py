@@ -104,14 +104,14 @@ class Peers:
         self._places = []
 
     def ended(self) -> bool:
-        """Tell whether a process of this machine ended, after waiting some seconds for one."""
-        end = time.monotonic() + _REAPED_SECONDS
+        """Tell whether a process of the run on this machine has ended; wait `_REAPED_SECONDS` at most for one."""
+        deadline = time.monotonic() + _REAPED_SECONDS
         here = socket.gethostname()
         process_ids = [process_id for host, process_id in self._places if host == here]
         if not process_ids:
             return False
         while all(_exists(process_id) for process_id in process_ids):
-            if time.monotonic() > end:
+            if time.monotonic() > deadline:
                 return False
             time.sleep(0.1)
         return True

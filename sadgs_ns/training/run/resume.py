@@ -106,28 +106,29 @@ class Resumption:
         note(f"Resuming after step {self.state['step']} of {self.path}")
 
 
-def check_same_capture(pipeline: SadgsPipeline, before: Sequence[str], positions_before: Tensor) -> None:
+def check_same_capture(pipeline: SadgsPipeline, names_before: Sequence[str], positions_before: Tensor) -> None:
     """Check that a checkpoint was trained on the pipeline's data, by its images' names and cameras' centres [C, 3].
 
-    Images may have been added or removed if the others' poses stayed. Raises InputError if less than half of the
-    cameras of the smaller capture are in the other; warns if the cameras are the same, and no image has its old name.
+    Images may have been added or removed if the others' poses stayed. Warns if no image has its old name.
+
+    Raises InputError if less than half of the cameras of the smaller capture are in the other.
     """
     dataset = pipeline.datamanager.train_dataset
-    now = [path.name for path in dataset.image_filenames]
+    names = [path.name for path in dataset.image_filenames]
     positions = camera_positions(dataset.cameras)
     distances, _ = KDTree(positions).query(positions_before)  # [C]
-    same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
-    if 2 * same < min(len(before), len(now)):
+    num_same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+    if 2 * num_same < min(len(names_before), len(names)):
         raise InputError(
             "It was trained on other data, or with other options of the parser: of its "
-            f"{len(before)} cameras ({before[0]}, …) {same or 'none'} stand where one of these {len(now)} "
-            f"({now[0]}, …) does."
+            f"{len(names_before)} cameras ({names_before[0]}, …) {num_same or 'none'} stand where one of these "
+            f"{len(names)} ({names[0]}, …) does."
         )
-    stems_before = {Path(name).stem for name in before}
-    stems_now = {Path(name).stem for name in now}
-    if stems_before.isdisjoint(stems_now):
+    stems_before = {Path(name).stem for name in names_before}
+    stems = {Path(name).stem for name in names}
+    if stems_before.isdisjoint(stems):
         warn(
             "The checkpoint's run had the same cameras, but none of its images had the name of one of "
-            f"these ({before[0]} and {now[0]} are the first): the Gaussians fit only if the images "
+            f"these ({names_before[0]} and {names[0]} are the first): the Gaussians fit only if the images "
             "were renamed."
         )

@@ -17,7 +17,7 @@ class StepRequests:
     signals: tuple[int, ...] = ()  # Stop because of these signals, by their numbers, in the order of `SIGNALS`.
 
     def encode(self) -> int:
-        """Return one whole number for `World.flags_out`; that of several processes is the bitwise or of theirs."""
+        """Return one whole number for `World.flags_out`; the bitwise or of all processes' holds what any asks for."""
         flags = 0
         if self.save:
             flags |= _SAVE

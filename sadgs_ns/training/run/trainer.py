@@ -107,15 +107,19 @@ class SadgsTrainer(Trainer):
             return False
         return self.world.is_single and model.backend == "triton" and model.tile_forecast is not None
 
-    def _explain(self, error: RuntimeError, full: str, remedy: str, kept: str) -> None:
-        """Raise RunError instead of an error of full memory, or of one that another process caused by its end.
+    def _explain(self, error: RuntimeError, memory: str, remedy: str, kept: str) -> None:
+        """Raise RunError if the GPU's memory was full, or if another process has ended; else return.
 
-        In its sentence, `full` says when the memory was full, `remedy` what to do, and `kept` what is saved.
+        Args:
+            error: What was raised.
+            memory: The words after "The GPU's memory", such as "was full at iteration 7".
+            remedy: What to do if the memory was full.
+            kept: What is saved if another process ended.
         """
         if isinstance(error, torch.cuda.OutOfMemoryError):
             first_sentences = reason(error).split(". ")[:2]  # Torch has many more.
             asked_for = ". ".join(first_sentences).rstrip(".")
-            raise RunError(f"The GPU's memory {full} ({asked_for}): {remedy}.") from error
+            raise RunError(f"The GPU's memory {memory} ({asked_for}): {remedy}.") from error
         if not isinstance(error, RunError) and self._peers is not None and self._peers.ended():
             raise RunError(f"Another process of the run ended, and this one with it: {kept}.") from error
 
@@ -162,7 +166,7 @@ class SadgsTrainer(Trainer):
                 f"This run is finished after {self._start_step} iterations: --max-num-iterations of more than "
                 f"{self._start_step} trains on."
             )
-        self._set_clock(0.0)
+        self._schedule_save(0.0)
         events.report("loop begins")
         try:
             self._train_until_interrupted(total)
@@ -170,8 +174,8 @@ class SadgsTrainer(Trainer):
             problem = str(error).rstrip(".")
             raise InputError(f"{problem}; {self._how_to_resume}.") from error
         except RuntimeError as error:
-            full = f"was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
-            self._explain(error, full, f"{_LESS_MEMORY}; {self._how_to_resume}", self._how_to_resume)
+            memory = f"was full at iteration {self.step} with {self.pipeline.model.num_points} Gaussians"
+            self._explain(error, memory, f"{_LESS_MEMORY}; {self._how_to_resume}", self._how_to_resume)
             raise
         finally:
             self.config.max_num_iterations = total
@@ -284,11 +288,11 @@ class SadgsTrainer(Trainer):
         self._stop_if_diverged()
         super()._train_complete_viewer()
 
-    def _set_clock(self, took: float) -> None:
-        """Set when the next checkpoint is due, after one that took `took` seconds to save."""
+    def _schedule_save(self, last_seconds: float) -> None:
+        """Set when the next checkpoint is due, after the last one took so many seconds to save."""
         wait = math.inf
         if self.config.steps_per_save == 0 and self.config.seconds_per_save > 0:
-            wait = max(self.config.seconds_per_save, took / _SAVING_SHARE)
+            wait = max(self.config.seconds_per_save, last_seconds / _SAVING_SHARE)
         self._save_due = time.monotonic() + wait
 
     def _stop(self, interrupted: Interrupted, total: int) -> None:
@@ -338,7 +342,7 @@ class SadgsTrainer(Trainer):
         raise RunError(f"{self.pipeline.diverged}; {remedy}; {kept}.")
 
     def save_checkpoint(self, step: int) -> None:
-        """Save as `checkpoints.write` does. Rank 0 gathers and writes the Gaussians of all processes."""
+        """Save a checkpoint by `checkpoints.write`. Rank 0 gathers and writes the Gaussians of all processes."""
         start = time.monotonic()
         state = {
             "step": step,
@@ -351,8 +355,8 @@ class SadgsTrainer(Trainer):
             state = checkpoints.map_rows(state, self.world.gather_rows)
         if processes.is_rank_zero():
             # If the run has diverged, an earlier checkpoint may be better.
-            keep = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
-            checkpoints.write(self.checkpoint_dir, step, state, keep)
-        self.world.all(True)
+            keep_others = not self.config.save_only_latest_checkpoint or bool(self.pipeline.diverged)
+            checkpoints.write(self.checkpoint_dir, step, state, keep_others)
+        self.world.all(True)  # All processes wait until rank 0 has written it.
         self._saved_step = step
-        self._set_clock(time.monotonic() - start)
+        self._schedule_save(time.monotonic() - start)

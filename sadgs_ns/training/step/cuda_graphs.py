@@ -103,7 +103,7 @@ class _Inputs:
 
     @staticmethod
     def like(group: ViewGroup, factors: Tensor) -> _Inputs:
-        """Make tensors for steps like this one."""
+        """Make the tensors for steps like a first one, with its values."""
         images = torch.stack([data["image"] for data in group.data])
         viewmats, Ks, *size = group.cameras
         cameras = Cameras(viewmats.clone(), Ks.clone(), *size)

@@ -147,19 +147,23 @@ class LazyImages(Sequence[dict[str, Any]]):
 
 
 def _undistort_cameras(cameras: Cameras) -> list[Undistortion | None]:
-    """Give cameras their undistorted images' intrinsics and sizes; return what undistorts each image, or None."""
+    """Set the cameras' intrinsics and sizes, in place, to those of their undistorted images.
+
+    Returns:
+        The undistortion of each camera's image, or None for a camera without distortion.
+    """
     undistortions: list[Undistortion | None] = [None] * len(cameras)
     distortion = cameras.distortion_params  # [C, D]
     if distortion is None or not distortion.any():
         return undistortions
     fields = [cameras.camera_type, cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height]
     rows = torch.cat([field.double() for field in (*fields, distortion)], dim=-1).numpy()  # [C, 7 + D]
-    known: dict[bytes, Undistortion] = {}
+    by_camera: dict[bytes, Undistortion] = {}  # Cameras with equal rows share one
     for index in distortion.any(dim=-1).nonzero().flatten().tolist():
-        row = rows[index].tobytes()
-        if row not in known:
-            known[row] = Undistortion(cameras[index].reshape(()))
-        undistortion = known[row]
+        key = rows[index].tobytes()
+        if key not in by_camera:
+            by_camera[key] = Undistortion(cameras[index].reshape(()))
+        undistortion = by_camera[key]
         undistortions[index] = undistortion
         cameras.fx[index] = float(undistortion.K[0, 0])
         cameras.fy[index] = float(undistortion.K[1, 1])

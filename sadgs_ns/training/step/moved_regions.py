@@ -30,7 +30,7 @@ class MovedRegions:
         return sorted(self._regions)
 
     def replace(self, regions: Mapping[int, Tensor]) -> list[int]:
-        """Put others, uint8 [h, w] on the device of training, in the place of all; return the photos that change."""
+        """Replace all regions by others, uint8 [h, w] on the device of training; return the photos that change."""
         changed = []
         for view in sorted(self._regions.keys() | regions.keys()):
             before = self._regions.get(view)
@@ -40,15 +40,17 @@ class MovedRegions:
         self._regions = dict(regions)
         return changed
 
-    def applied(self, view: int, data: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return a photo's data with a `mask`, bool [H, W, 1], that hides its region, too; `data` itself without one.
+    def masked(self, view: int, data: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return a photo's data with its region hidden: False in `mask`, bool [H, W, 1], besides what that hid before.
 
-        Data without `image`, of a view that only other processes composite, stay as they are.
+        `data` itself is returned if the photo has no region, or if it has no `image`, as of a view that only other
+        processes composite.
         """
         if view not in self._regions or "image" not in data:
             return data
         image = data["image"]
-        mask = ~self.hidden(view, image.shape[:2])[:, :, None].to(image.device)
+        hidden = self.hidden(view, image.shape[:2])
+        mask = ~hidden[:, :, None].to(image.device)
         if "mask" in data:
             mask &= data["mask"].to(image.device)
         return {**data, "mask": mask}

@@ -12,14 +12,21 @@ DIVERGED_STEPS = 100  # Steps in a row that were not finite after which a run st
 
 
 class NonFiniteLog:
-    """Losses and flags of up to `capacity` steps; of all `steps` read, the last `streak` were not finite."""
+    """Losses and flags of up to `capacity` steps.
+
+    Attributes:
+        capacity: The most steps that the log holds until it is read.
+        steps: Number of steps that were read.
+        streak: Number of the last of them that were not finite.
+    """
 
     def __init__(self, device: torch.device | str, capacity: int = 100) -> None:
         self._losses: list[Tensor] = []  # scalars on the device
-        # The first column is NaN if a gradient was left out. Rows of 16 bytes keep Triton from compiling Adam anew.
+        # The first column is NaN if a gradient was left out. A row has 16 bytes, because Triton would compile Adam anew
+        # for an address that is no multiple of 16.
         self._gradients = torch.zeros((capacity, 4), device=device)
         self._flags = self._gradients[:, :1].unbind()  # made once, because slicing takes the host long
-        self._steps: list[tuple[int, list[int]]] = []
+        self._recorded: list[tuple[int, list[int]]] = []  # Number and views of each step
         self.capacity = capacity
         self.steps = 0
         self.streak = 0
@@ -27,37 +34,41 @@ class NonFiniteLog:
     @property
     def full(self) -> bool:
         """Whether the log must be read before it can hold another step."""
-        return len(self._steps) >= self.capacity
+        return len(self._recorded) >= self.capacity
 
     @property
     def nonfinite_flag(self) -> Tensor:
         """The flag of the present step, which is not recorded yet; NaN if a gradient was not finite. float32 [1]"""
-        return self._flags[len(self._steps)]
+        return self._flags[len(self._recorded)]
 
     def record(self, step: int, views: list[int], loss: Tensor) -> None:
         """Add a step with its views and its loss, a scalar that must not change in place."""
         self._losses.append(loss)
-        self._steps.append((step, views))
+        self._recorded.append((step, views))
 
     def read(self) -> list[tuple[int, list[int], str]]:
-        """Return number, views and problem of each step that was not finite, and empty the log; this waits."""
-        if not self._steps:
+        """Return number, views and problem of each step that was not finite, and empty the log.
+
+        This waits for the device.
+        """
+        if not self._recorded:
             return []
         problems = []
         losses = torch.stack(self._losses).tolist()
-        gradients = self._gradients[: len(self._steps), 0].tolist()
-        for (step, views), loss, gradient in zip(self._steps, losses, gradients, strict=True):
+        gradients = self._gradients[: len(self._recorded), 0].tolist()
+        for (step, views), loss, gradient in zip(self._recorded, losses, gradients, strict=True):
+            problem = None
             if not math.isfinite(loss):
                 problem = f"the loss was {loss}"
             elif not math.isfinite(gradient):
                 problem = "gradients were not finite"
-            else:
+            if problem is None:
                 self.streak = 0
-                continue
-            self.streak += 1
-            problems.append((step, views, problem))
-        self.steps += len(self._steps)
-        self._steps.clear()
+            else:
+                self.streak += 1
+                problems.append((step, views, problem))
+        self.steps += len(self._recorded)
+        self._recorded.clear()
         self._losses.clear()
         self._gradients.zero_()
         return problems

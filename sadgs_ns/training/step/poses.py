@@ -52,12 +52,13 @@ class RefinedPoses(torch.nn.Module):
         sizes: Tensor,  # Width and height in px. [V, 2]
         points: Tensor,  # Points of the scene. [P, 3]
     ) -> None:
-        """Set the initial poses, and what is derived of them and of the scene's depth; it does not change later."""
+        """Set the initial poses, and derive units and gauge from them and the scene's depth; all are then fixed."""
         exact = viewmats.double().cpu()
         Ks = Ks.double().cpu()
         sizes = sizes.double().cpu()
-        some = points[:: len(points) // _POINTS + 1].double().cpu()
-        motion = image_motion(Ks, sizes, view_depths(exact, Ks, sizes, some))
+        sample = points[:: len(points) // _POINTS + 1].double().cpu()
+        depths = view_depths(exact, Ks, sizes, sample)
+        motion = image_motion(Ks, sizes, depths)
         self.initial = viewmats.to(self.table)
         self.units = pixel_steps(motion).to(self.table)
         self.gauge = Gauge.of(self.initial, motion)
@@ -91,9 +92,9 @@ class RefinedPoses(torch.nn.Module):
     def row_update(
         self,
         views: list[Tensor],  # Indices of the views of each group of a step. int64 [C] each
-        overflowed: list[Tensor | None],  # A number of each group that is not 0 if it was not drawn. int64 [1] each
+        overflowed: list[Tensor | None],  # Of each group: 0 if it was drawn, or None if it surely was. int64 [1] each
     ) -> RowUpdate:
-        """Return which corrections a step moves: those of the views that it drew."""
+        """Return which corrections a step moves: those of the views that it drew. It does not wait for the device."""
         moved = torch.zeros_like(self.units[:, 0], dtype=torch.bool)
         for view_ids, flag in zip(views, overflowed, strict=True):
             if flag is None:

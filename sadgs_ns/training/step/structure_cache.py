@@ -31,7 +31,7 @@ class StructureCache:
 
     Attributes:
         photo: Returns an image of the datamanager as the loss sees it: on the device and the background. [H, W, 3]
-        of_images: `multiscale_structure_tensor` with the run's constant c in 1/px and its other `options`.
+        of_images: `multiscale_structure_tensor` with the run's constant c of ω_l = c / σ_l and its other `options`.
     """
 
     def __init__(

@@ -188,11 +188,13 @@ def _compare(
 def _moved_poses(
     model: SadgsModel, groups: Sequence[ViewGroup], infos: Sequence[Mapping[str, Any]]
 ) -> RowUpdate | None:
-    """Return which poses a step moves, those of the views that were drawn; None if poses are fixed."""
+    """Return which poses a step moves: those of the views that were drawn. None if poses are fixed."""
     if model.poses is None:
         return None
+    # With poses, each group has its `view_ids`.
     views = [group.view_ids for group in groups if group.view_ids is not None]
-    return model.poses.row_update(views, [info.get("overflowed") for info in infos])
+    overflowed = [info.get("overflowed") for info in infos]
+    return model.poses.row_update(views, overflowed)
 
 
 def _gradient_of(leaf: Tensor) -> Tensor:

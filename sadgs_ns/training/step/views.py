@@ -60,17 +60,23 @@ class ViewSampler:
         """Take the views of a step from an order, the sampler's own or a copy of it."""
         step: list[int] = []
         while len(step) < number:
-            drawn = step[len(step) // self.num_views * self.num_views :]  # Beyond all views, each comes again.
-            place = next((place for place, view in enumerate(order) if view not in drawn), None)
-            if place is not None:
-                step.append(order.pop(place))
-                continue
-            following = list(range(self.num_views))
-            self._generator.shuffle(following)
-            self._order += following
-            if order is not self._order:
-                order += following
+            # A step of more views than there are takes all of them before one comes again.
+            num_rounds = len(step) // self.num_views
+            drawn = step[num_rounds * self.num_views :]
+            position = next((position for position, view in enumerate(order) if view not in drawn), None)
+            if position is None:
+                self._append_round(order)
+            else:
+                step.append(order.pop(position))
         return step
+
+    def _append_round(self, order: list[int]) -> None:
+        """Append another round to the sampler's own order, and to `order` if it is a copy."""
+        views = list(range(self.num_views))
+        self._generator.shuffle(views)
+        self._order += views
+        if order is not self._order:
+            order += views
 
 
 class TrainingViews:
@@ -121,20 +127,25 @@ class TrainingViews:
         if prefetcher is None:
             cached = self.datamanager.cached_train
             device = self.model.device
-            drawn = [(i, {**cached[i], "image": cached[i]["image"].to(device, non_blocking=True)}) for i in indices]
-            return [(i, self.moved.applied(i, data)) for i, data in drawn]
+            drawn = []
+            for index in indices:
+                image = cached[index]["image"].to(device, non_blocking=True)
+                drawn.append((index, self.moved.masked(index, {**cached[index], "image": image})))
+            return drawn
         data = prefetcher.take(self._composited(indices))
-        share = math.ceil(number / self.model.world.num_ranks)
+        share = math.ceil(number / self.model.world.num_ranks)  # Views of a step that a process loads
         threads = prefetcher.threads
-        steps = [self._composited(step) for step in self.sampler.foresee(number, 2 + math.ceil(threads / share))]
+        upcoming = self.sampler.foresee(number, 2 + math.ceil(threads / share))
+        steps = [self._composited(step) for step in upcoming]
         # The number of views under way is the same in each step, so that none is forgotten before its step.
         most = max(threads + 2 * share, len(steps[0]))
-        prefetcher.prefetch(list(dict.fromkeys(chain(*steps)))[:most], following=steps[0])
-        return [(index, self.moved.applied(index, data.get(index, {}))) for index in indices]
+        views = list(dict.fromkeys(chain(*steps)))  # Each once, in the order of the steps
+        prefetcher.prefetch(views[:most], following=steps[0])
+        return [(index, self.moved.masked(index, data.get(index, {}))) for index in indices]
 
     def cached(self, index: int) -> Mapping[str, Any]:
         """Data of a training view where the datamanager keeps it, with a mask that hides what moved, too."""
-        return self.moved.applied(index, self.datamanager.cached_train[index])
+        return self.moved.masked(index, self.datamanager.cached_train[index])
 
     def _composited(self, indices: Sequence[int]) -> list[int]:
         """Return the views of a step, each once, of which this process composites rows."""

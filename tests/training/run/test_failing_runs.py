@@ -511,7 +511,7 @@ def test_a_file_of_the_user_s_among_checkpoints_is_passed_over_and_kept(name: st
         shutil.copy(saved, tmp_path / path)
     actual = checkpoints.checkpoint_paths(tmp_path, None, None)
     assert actual == [tmp_path / saved.name]
-    checkpoints.write(tmp_path, 9, {}, keep=False)
+    checkpoints.write(tmp_path, 9, {}, keep_others=False)
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"step-000000009.ckpt", name}
 

@@ -20,18 +20,18 @@ def photo(**other: Any) -> dict[str, Any]:
 def test_a_photo_without_region_stays_as_it_is():
     regions = MovedRegions()
     data = photo()
-    assert regions.applied(0, data) is data
+    assert regions.masked(0, data) is data
     regions.replace({1: REGION})
-    assert regions.applied(0, data) is data
+    assert regions.masked(0, data) is data
     elsewhere: dict[str, Any] = {}  # Another process composites the view.
-    assert regions.applied(1, elsewhere) is elsewhere
+    assert regions.masked(1, elsewhere) is elsewhere
 
 
 def test_a_region_is_hidden_at_the_size_of_the_photo():
     regions = MovedRegions()
     regions.replace({1: REGION})
     data = photo()
-    mask = regions.applied(1, data)["mask"]
+    mask = regions.masked(1, data)["mask"]
     expected = torch.ones((6, 8, 1), dtype=torch.bool)
     expected[:2, :4] = False
     assert torch.equal(mask, expected)
@@ -44,7 +44,7 @@ def test_what_a_given_mask_hides_stays_hidden():
     regions.replace({1: REGION})
     given = torch.ones((6, 8, 1), dtype=torch.bool)
     given[5] = False
-    mask = regions.applied(1, photo(mask=given))["mask"]
+    mask = regions.masked(1, photo(mask=given))["mask"]
     assert not mask[5].any() and not mask[0, 0] and mask[3].all()
     assert given[0].all()
 
