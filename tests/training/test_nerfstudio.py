@@ -535,7 +535,7 @@ def killed(state, path):
     path.write_bytes(b"half a checkpoint")
     os.kill(os.getpid(), signal.SIGKILL)
 torch.save = killed
-checkpoints.write(Path({str(trainer.checkpoint_dir)!r}), 2, {{}}, keep=False)
+checkpoints.write(Path({str(trainer.checkpoint_dir)!r}), 2, {{}}, keep_others=False)
 """
     assert forked_python.python(code).returncode == -9
     assert len(list(tmp_path.rglob("*.partial"))) == 1
