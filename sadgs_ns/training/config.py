@@ -238,7 +238,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     """Memory of the GPU, in 10⁹ bytes, that training may take; the cap of Gaussians is lowered to it at the start.
     None is 80 % of the free memory. If `max_gaussians` was changed, None leaves it as it is."""
     frequency_constant: float = FREQUENCY_CONSTANT
-    """c of ω_l = c / σ_l in 1/px, at most 4: the larger, the shorter every wavelength and the more is split."""
+    """c of the frequencies ω_l = c / σ_l, at most 4. A larger c makes every wavelength shorter, and more is split."""
     energy_blur: float = ENERGY_BLUR
     """Window, in multiples of σ_l, over which the energy of a scale is averaged; 0 measures it per pixel (eq. 4)."""
     epsilon: float | None = None
