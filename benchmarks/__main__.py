@@ -22,7 +22,7 @@ from tyro.conf import Positional
 from benchmarks import gate, protocol, results
 from benchmarks.protocol import Job
 from benchmarks.results import Result
-from benchmarks.side_by_side import devices_of, environment_of, run_side_by_side, sigterm_exits
+from benchmarks.side_by_side import append_output, devices_of, environment_of, run_side_by_side, sigterm_exits
 from benchmarks.table import markdown
 
 COMMANDS = {
@@ -51,14 +51,12 @@ Launch = Callable[[Job, "str | None", Path], "subprocess.Popen[bytes]"]
 def _result(job: Job, code: int, folder: Path, log: Path) -> Result:
     """Return the measurements of a process that has ended; if it failed, its output is added to the log."""
     written = folder / "result.json"
-    output = folder / "log"
     error = f"the run ended with code {code} and no result; see {log}."
     measured = {"status": "failed", "error": error}
     if written.exists():
         measured = json.loads(written.read_text())
-    if measured["status"] == "failed" and output.exists():
-        with log.open("a") as file:
-            file.write(f"=== {job.key}\n{output.read_text(errors='replace')}\n")
+    if measured["status"] == "failed" and (folder / "log").exists():
+        append_output(job.key, folder, log)
     identity = {"scene": job.scene.name, "label": job.row.label, "method": job.row.method, "seed": job.seed}
     return {"key": job.key, **identity, "overrides": job.row.overrides, **measured}
 

@@ -25,7 +25,7 @@ from typing import Any
 from benchmarks import results
 from benchmarks.chain_table import markdown
 from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, photos_of, write_row, written_row
-from benchmarks.side_by_side import environment_of, run_program
+from benchmarks.side_by_side import append_output, environment_of, run_program
 
 INTERVAL = 8  # Every so many photos, from the first in the order of their names, one is held out.
 LOADER = (
@@ -132,9 +132,7 @@ def row_of(chain: Chain, work: Path, site: Path | None, log: Path) -> dict[str, 
     try:
         measured = run_chain(chain, work, site)
     except subprocess.CalledProcessError as error:
-        output = (work / "log").read_text(errors="replace")
-        with log.open("a") as file:
-            file.write(f"=== {chain.key}\n{output}\n")
+        append_output(chain.key, work, log)
         name = error.cmd[3]  # It follows Python, "-c" and the code.
         return failed(chain, date, f"{name} ended with code {error.returncode}; see {log}.")
     return {**identity(chain, date), "status": "ok", "error": None, **measured}

@@ -27,7 +27,7 @@ from benchmarks.photo_captures import PhotoCommand, exit_status, load_protocol, 
 from benchmarks.plots import save
 from benchmarks.run import software
 from benchmarks.seconds_table import Part, markdown
-from benchmarks.side_by_side import environment_of, run_program
+from benchmarks.side_by_side import append_output, environment_of, run_program
 from sadgs_ns.events import TRACE
 
 PROGRAMS = {"sadgs": "sadgs_ns.cli.sadgs", "sadgs-process": "sadgs_ns.cli.process"}
@@ -167,9 +167,7 @@ def row_of(run: Run, work: Path, log: Path) -> dict[str, Any]:
     try:
         measured = measure(run, work)
     except subprocess.CalledProcessError as error:
-        output = (work / "log").read_text(errors="replace")
-        with log.open("a") as file:
-            file.write(f"=== {run.key}\n{output}\n")
+        append_output(run.key, work, log)
         return run.row(date, status="failed", error=f"{run.program} ended with code {error.returncode}; see {log}.")
     return run.row(date, status="ok", error=None, **measured, **about())
 

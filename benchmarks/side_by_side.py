@@ -67,6 +67,13 @@ def run_program(
         )
 
 
+def append_output(key: str, work: Path, log: Path) -> None:
+    """Append to a log what the programs of a run printed into `log` in its folder, under the run's key."""
+    output = (work / "log").read_text(errors="replace")
+    with log.open("a") as file:
+        file.write(f"=== {key}\n{output}\n")
+
+
 def run_side_by_side(
     jobs: Sequence[Job],
     launch: Callable[[Job, str | None, Path], subprocess.Popen[bytes]],
