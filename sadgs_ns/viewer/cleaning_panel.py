@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from sadgs_ns.errors import InputError, reason
 from sadgs_ns.geometry.cleaning import Cleaning, Visibility, choose_remaining, measure_visibility
 from sadgs_ns.viewer.cleaning_text import check_options, removal_sentences
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
-from sadgs_ns.viewer.shown_run import ShownRun
+from sadgs_ns.viewer.shown_run import GaussiansReference, ShownRun
 
 OUTPUT = "cleaned"  # Name of the panel's picture among the viewer's output types
 
@@ -40,7 +39,7 @@ class CleaningPanel(torch.nn.Module):
         self._visibility: Visibility | None = None
         self._measured_at: tuple[int, int] | None = None  # Number of Gaussians and iteration of `_visibility`
         self._stays = torch.ones(0, dtype=torch.bool)  # Which Gaussians stay. [N]
-        self._means: weakref.ref[Tensor] | None = None  # The parameter of the Gaussians that `_stays` is of
+        self._gaussians: GaussiansReference | None = None  # Those that `_stays` is of
         self._shown = OFF
         self._text = ""
         self.choice = ViewerDropdown(
@@ -103,11 +102,12 @@ class CleaningPanel(torch.nn.Module):
         cleaning = self.cleaning
         if cleaning.needs_views:
             self._measure_visibility()
+        gaussians = self._run.present_gaussians()
         params = dict(self._run.model.gauss_params.items())
         remaining = choose_remaining(params, cleaning, self._visibility)
         stays = remaining.stays
         self._stays = stays
-        self._means = weakref.ref(params["means"])
+        self._gaussians = gaussians
         self._shown = self.choice.value
         sentences = removal_sentences(cleaning, remaining)
         sentences.append(f"{int(stays.sum()):,} of {len(stays):,} Gaussians would stay.")
@@ -133,11 +133,10 @@ class CleaningPanel(torch.nn.Module):
         self.text.refresh()
 
     def _is_outdated(self) -> bool:
-        """Tell whether `_stays` is of other Gaussians than the model's. Densification replaces the parameters."""
-        means = self._run.model.gauss_params["means"]
-        if self._means is None or self._means() is not means:
+        """Tell whether `_stays` is of other Gaussians than the model's."""
+        if not self._run.are_present(self._gaussians):
             return True
-        return len(self._stays) != len(means)
+        return len(self._stays) != self._run.model.num_points
 
     def outputs(self, camera: Cameras, rendered: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return `cleaned`, a picture of the Gaussians that stay or go. [H, W, 3] in [0, 1]

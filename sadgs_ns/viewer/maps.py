@@ -108,7 +108,7 @@ class Ellipses:
 
 
 def structure_ellipses(structure_tensor: Tensor, frequency_constant: float = FREQUENCY_CONSTANT) -> Ellipses:
-    """Return S̄⁻¹ at the textured pixels of a regular grid. S̄ is (xx, xy, yy) in 1/px² [H, W, 3], and c in 1/px."""
+    """Return S̄⁻¹ at the textured pixels of a regular grid. S̄ is (xx, xy, yy) in 1/px². [H, W, 3]"""
     height, width = structure_tensor.shape[:2]
     spacing = max(min(height, width) / ELLIPSES_ACROSS, 1.0)
     rows = torch.arange(spacing / 2, height, spacing)
@@ -143,7 +143,7 @@ def draw_ellipses(image: Picture, structure_tensor: Tensor, constant: float, siz
     Args:
         image: The picture of which S̄ was computed. [H, W, 3]
         structure_tensor: S̄ as (xx, xy, yy) in 1/px². [H, W, 3]
-        constant: The constant c in 1/px.
+        constant: The constant c of ω_l = c / σ_l.
         size: Height and width in px of the result.
     """
     ellipses = structure_ellipses(structure_tensor, constant)

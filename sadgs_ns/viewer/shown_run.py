@@ -5,6 +5,7 @@ Training makes these parts, and the viewer imports nothing of it.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -19,6 +20,8 @@ from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.render.types import RenderOptions
 
+GaussiansReference = weakref.ref[Tensor]
+"""The Gaussians of one time of a run, until densification replaces them."""
 Progress = Callable[[range], Iterable[int]]
 """Gets the numbers of the training views, yields them one after another, and shows how far it is."""
 
@@ -94,7 +97,7 @@ class StructureTensors(Protocol):
 
     @property
     def frequency_constant(self) -> float:
-        """The constant c of the wavelength, in 1/px."""
+        """The constant c of ω_l = c / σ_l."""
         ...
 
     @property
@@ -131,3 +134,14 @@ class ShownRun:
     """Observes η of the present Gaussians once in each training view, and returns the sums of `method.statistics`."""
     warn: Callable[[str], None]
     """Prints a warning for the user."""
+
+    def present_gaussians(self) -> GaussiansReference:
+        """Return a reference to the model's Gaussians, which `are_present` takes later."""
+        return weakref.ref(self.model.gauss_params["means"])
+
+    def are_present(self, gaussians: GaussiansReference | None) -> bool:
+        """Tell whether the model still has these Gaussians; None is none.
+
+        Densification replaces the parameters. Their number tells less, since it may stay.
+        """
+        return gaussians is not None and gaussians() is self.model.gauss_params["means"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import weakref
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -22,7 +21,7 @@ from sadgs_ns.method.quantization import dequantize
 from sadgs_ns.viewer import color_scales, maps
 from sadgs_ns.viewer.color_scales import CHILDREN, ETA, LOW, PERIOD, Panel, Picture, to_picture
 from sadgs_ns.viewer.elements import ViewerMarkdown, show_output
-from sadgs_ns.viewer.shown_run import Plan, ShownRun
+from sadgs_ns.viewer.shown_run import GaussiansReference, Plan, ShownRun
 
 OUTPUT = "structure"  # Name of the panel's picture among the viewer's output types
 
@@ -109,7 +108,7 @@ class StructurePanel(torch.nn.Module):
         super().__init__()
         self._run = run
         self._observed: dict[str, Tensor] = {}  # Statistics from `observe_now`
-        self._means: weakref.ref[Tensor] | None = None  # The parameter of the Gaussians that `_observed` is of
+        self._gaussians: GaussiansReference | None = None  # Those that `_observed` is of
         self._refreshed = 0.0  # Time of the last `refresh`
         self._status = ""  # Text above the table
         self._shown = OFF  # Choice that `outputs` draws
@@ -194,8 +193,7 @@ class StructurePanel(torch.nn.Module):
         running = model.strategy_state.get("n_total")  # The run drops its statistics when densification ends. [N]
         if running is not None and len(running) == model.num_points and bool((running > 0).any()):
             return model.strategy_state
-        means = model.gauss_params["means"]  # Densification replaces this parameter.
-        if self._means is None or self._means() is not means:
+        if not self._run.are_present(self._gaussians):
             return None
         observed = self._observed.get("n_total")  # [N]
         if observed is not None and len(observed) == model.num_points:
@@ -207,9 +205,9 @@ class StructurePanel(torch.nn.Module):
         self._disable_button(True)
         try:
             self._read_photos()
-            means = weakref.ref(self._run.model.gauss_params["means"])
+            gaussians = self._run.present_gaussians()
             self._observed = self._run.observe(self._with_progress)
-            self._means = means
+            self._gaussians = gaussians
         finally:
             self._disable_button(False)
         num_views = len(self._run.datamanager.train_dataset)
