@@ -1,8 +1,9 @@
 """Training steps of few Gaussians as CUDA graphs: one call on the host launches all kernels of a step.
 
 On a small scene the host takes longer to launch a step than the GPU to run it. A graph repeats launches with the
-arguments with which they were captured. So cameras, images and Adam's rates are copied, before each step, into tensors
-that keep their addresses. All else that a step depends on is part of its graph's key. Densification drops all graphs.
+arguments with which they were captured. So cameras, images, masks and Adam's rates are copied, before each step, into
+tensors that keep their addresses. All else that a step depends on is part of its graph's key. Densification drops all
+graphs.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from sadgs_ns.errors import reason
 from sadgs_ns.render.types import Cameras
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.run.progress import warn
+from sadgs_ns.training.step.images import stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
 from sadgs_ns.training.step.train_step import StepResult, ViewGroup, training_step
 
@@ -105,12 +107,16 @@ class _Inputs:
     def like(group: ViewGroup, factors: Tensor) -> _Inputs:
         """Make the tensors for steps like a first one, with its values."""
         images = torch.stack([data["image"] for data in group.data])
+        masks = _masks_of(group)
+        if masks is not None:
+            masks = masks.clone()
         viewmats, Ks, *size = group.cameras
         cameras = Cameras(viewmats.clone(), Ks.clone(), *size)
         view_ids = group.view_ids
         if view_ids is not None:
             view_ids = view_ids.clone()
-        copied = replace(group, cameras=cameras, view_ids=view_ids, data=[{}] * len(images), images=images)
+        data = [{}] * len(images)
+        copied = replace(group, cameras=cameras, view_ids=view_ids, data=data, images=images, masks=masks)
         return _Inputs(copied, factors.to(images.device))
 
     def write(self, group: ViewGroup, factors: Tensor) -> None:
@@ -120,7 +126,15 @@ class _Inputs:
         if self.group.view_ids is not None and group.view_ids is not None:
             self.group.view_ids.copy_(group.view_ids)
         torch.stack([data["image"] for data in group.data], out=self.group.images)
+        masks = _masks_of(group)
+        if self.group.masks is not None and masks is not None:
+            self.group.masks.copy_(masks)
         self.factors.copy_(factors, non_blocking=True)
+
+
+def _masks_of(group: ViewGroup) -> Tensor | None:
+    """Return the masks of a group's views, ones where a view has none; None if no view has. bool [V, H, W, 1]"""
+    return stack_masks(group.data, (group.cameras.height, group.cameras.width), group.cameras.viewmats.device)
 
 
 class GraphedSteps:
@@ -162,8 +176,8 @@ class GraphedSteps:
         state = self._model.strategy_state
         group = groups[0]
         step = self._model.step
-        # Transparency and masks take more launches.
-        plain = all("mask" not in data and data["image"].shape[-1] == 3 for data in group.data)
+        # Transparency takes more launches.
+        plain = all(data["image"].shape[-1] == 3 for data in group.data)
         known = group.options.tile_capacity is not None and (not group.options.absgrad or "grad2d" in state)
         observes = group.structure_tensors is not None
         if self.failure or len(groups) > 1 or not plain or not known or observes or strategy.densifies(step):
@@ -191,7 +205,9 @@ class GraphedSteps:
         if addresses != self._addresses:
             self._drop()
             self._addresses = addresses
-        key = group.cameras[2:], group.options, opacity_reg, group.data[0]["image"].dtype, len(group.indices)
+        is_masked = any("mask" in data for data in group.data)
+        image = group.data[0]["image"]
+        key = group.cameras[2:], group.options, opacity_reg, image.dtype, len(group.indices), is_masked
         wanted = key in self._launched and key not in self._graphs and len(self._graphs) < MOST_GRAPHS
         if wanted and has_room(update.device):
             try:

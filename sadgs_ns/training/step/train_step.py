@@ -38,6 +38,7 @@ class ViewGroup:
     view_ids: Tensor | None = None  # `indices` on the device if views have matrices or refined poses. int64 [V]
     structure_tensors: Tensor | None = None  # Quantized S̄ if η is observed. uint8 [V, H, W, 3]
     images: Tensor | None = None  # The images, if they are in one tensor already. [V, H, W, 3]
+    masks: Tensor | None = None  # The masks, if `images` is there and a view has one. bool [V, H, W, 1]
 
     def batch(self, band: Band | None) -> dict[str, Tensor]:
         """Return `image` and, if a view has a mask, `mask` of all views [V, H, W, ·], or of a band's rows."""
@@ -49,7 +50,9 @@ class ViewGroup:
         if images is None:
             images = stack([data["image"] for data in self.data])
         batch = {"image": images}
-        masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
+        masks = self.masks
+        if masks is None:
+            masks = stack_masks(self.data, batch["image"].shape[1:3], self.cameras.viewmats.device)
         if masks is not None:
             batch["mask"] = masks
         return batch

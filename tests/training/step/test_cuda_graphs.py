@@ -269,6 +269,8 @@ def test_a_graph_reads_what_changes_and_what_it_cannot_read_makes_another(
     image = one_step.pipeline.datamanager.cached_train[0]
     negative = 255 - image["image"]
     floats = image["image"] / 500
+    mask = torch.ones((*image["image"].shape[:2], 1), dtype=torch.bool)
+    mask[: len(mask) // 2] = False
 
     def state(name: str) -> dict[str, Tensor]:
         return next(iter(adams[name].state.values()))
@@ -292,6 +294,11 @@ def test_a_graph_reads_what_changes_and_what_it_cannot_read_makes_another(
         "AbsGS": lambda patch: patch.setattr(model.strategy, "needs_absgrad", lambda step: False),
         "lists that are too short": lambda patch: patch.setattr(model.tile_forecast, "capacity", lambda *_: 7),
         "an image of floats": lambda patch: patch.setitem(image, "image", floats),
+        "a mask": lambda patch: patch.setitem(image, "mask", mask),
+    }
+    # The graph of masked steps is there when this one comes.
+    masked: dict[str, Callable[[pytest.MonkeyPatch], Any]] = {
+        "another mask": lambda patch: patch.setitem(image, "mask", ~mask),
     }
     assert graphed is not None
     assert model.tile_forecast is not None
@@ -306,7 +313,7 @@ def test_a_graph_reads_what_changes_and_what_it_cannot_read_makes_another(
     monkeypatch.setattr(model.tile_forecast, "overflowed", noted)
     before = one_step.trained(graphed=True)
     assert graphed.replayed > 0
-    for name, change in (read | keys).items():
+    for name, change in (read | keys | masked).items():
         with monkeypatch.context() as patch:
             replayed = graphed.replayed
             apply = partial(change, patch)
@@ -342,17 +349,16 @@ def test_where_capturing_fails_the_steps_are_launched_one_by_one_and_one_sentenc
 
 
 @on_cpu
-def test_steps_of_many_gaussians_or_of_masked_views_are_launched_one_by_one(
+def test_steps_of_many_gaussians_or_of_transparent_views_are_launched_one_by_one(
     one_step: OneStep, monkeypatch: pytest.MonkeyPatch
 ):
     graphed = one_step.graphed
     image = one_step.pipeline.datamanager.cached_train[0]
     assert graphed is not None
-    mask = torch.ones((*image["image"].shape[:2], 1), dtype=torch.bool)
-    transparent = torch.cat([image["image"], 255 * mask], dim=-1)
+    opaque = torch.full((*image["image"].shape[:2], 1), 255, dtype=torch.uint8)
+    transparent = torch.cat([image["image"], opaque], dim=-1)
     for change in (
         lambda patch: patch.setattr(cuda_graphs, "MOST_GAUSSIANS", one_step.model.num_points - 1),
-        lambda patch: patch.setitem(image, "mask", mask),
         lambda patch: patch.setitem(image, "image", transparent),
         lambda patch: patch.setattr(cuda_graphs, "MOST_GRAPHS", 0),
         lambda patch: patch.setattr(cuda_graphs, "has_room", lambda device: False),
