@@ -143,7 +143,8 @@ class Command:
         self.output.mkdir(parents=True, exist_ok=True)
         files: Sequence[Path] = pipeline.datamanager.train_dataset.image_filenames
         for index, file in enumerate(files):
-            size = tuple(verdict.views[index].depth.shape)
+            view = verdict.view(index)
+            size = view.size
             true = true_region(file, size)
             region = verdict.regions.get(index)
             wanted = file.stem in self.only.split(",")
@@ -152,7 +153,7 @@ class Command:
             if not wanted:
                 continue
             photo, drawn = search.pictures(index)
-            drawing = picture((verdict.views[index], verdict.excesses[index], region), photo, drawn, true)
+            drawing = picture((view, verdict.excesses[index], region), photo, drawn, true)
             Image.fromarray(drawing).save(self.output / f"{file.stem}.png")
             print(f"{file.name}: {_describe(region, true, size)}", flush=True)
         return 0

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -53,7 +54,8 @@ DILATION = 1
 differences reach beyond outlines, too."""
 _SAMPLES = 200_000  # Pixels of all views of which median and spread are taken
 _POINTS = 1000  # Points on surfaces that tell which views see the same things
-_PIXELS_TOGETHER = 2**22  # Pixels that are compared at a time with those of neighbours, in arrays of 50 MB
+_PIXELS_TOGETHER = 2**23  # Pixels that are compared at a time with those of neighbours, in arrays of 100 MB
+_MARKED_TOGETHER = 2**23  # Pixels that are marked at a time
 _FEWEST_PIXELS = 4  # Of a region in the smallest photos
 _CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)  # A pixel and the four beside it
 _STRONG, _WEAK, _STRUCTURAL = 1, 2, 4  # Bits of `_marks`
@@ -70,6 +72,12 @@ class SmallView:
     valid: Tensor  # False where a mask hides the photo. bool [h, w]
     viewmat: Tensor  # World to camera. [4, 4]
     K: Tensor  # Intrinsics in px at this size. [3, 3]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in px."""
+        height, width = self.depth.shape
+        return height, width
 
 
 @dataclass(frozen=True)
@@ -151,6 +159,7 @@ class Group:
 
     members: list[int]
     difference: Tensor  # [V, h, w]
+    structure: Tensor  # [V, h, w]
     depth: Tensor  # [V, h, w]
     valid: Tensor  # bool [V, h, w]
     viewmat: Tensor  # [V, 4, 4]
@@ -168,9 +177,15 @@ class Group:
         return {index: place for place, index in enumerate(self.members)}
 
     @cached_property
-    def greatest_nearby(self) -> Tensor:
-        """Greatest difference near each pixel. [V, h, w]"""
-        return F.max_pool2d(self.difference[:, None], WINDOW, 1, WINDOW // 2)[:, 0]
+    def planes(self) -> Tensor:
+        """What other views read: the greatest difference near each pixel, the depth, and 1 where valid. [V, 3, h, w]"""
+        nearby = F.max_pool2d(self.difference[:, None], WINDOW, 1, WINDOW // 2)[:, 0]
+        return torch.stack([nearby, self.depth, self.valid.to(nearby)], dim=1)
+
+    def view(self, place: int) -> SmallView:
+        """Return one of the views, which shares the group's memory."""
+        parts = (self.difference, self.structure, self.depth, self.valid, self.viewmat, self.K)
+        return SmallView(*[part[place] for part in parts])
 
 
 def grouped(views: Sequence[SmallView]) -> list[Group]:
@@ -181,7 +196,7 @@ def grouped(views: Sequence[SmallView]) -> list[Group]:
     groups = []
     for indices in members.values():
         stacked = {}
-        for name in ("difference", "depth", "valid", "viewmat", "K"):
+        for name in ("difference", "structure", "depth", "valid", "viewmat", "K"):
             stacked[name] = torch.stack([getattr(views[index], name) for index in indices])
         groups.append(Group(indices, **stacked))
     return groups
@@ -260,39 +275,71 @@ def _carried(
 
     NaN where a neighbour does not count, and in place of those that a view has fewer than `NEIGHBOURS`.
     """
-    height, width = group.size
-    depth = group.depth[part][:, None]  # [V, 1, h, w]
+    points = _points_in_camera(group, part)  # [V, 3, h, w]
+    depth = group.depth[part]
     to_world = group.viewmat[part].double().inverse()
-    K = group.K[part]
-    x = torch.arange(width, device=depth.device) + 0.5
-    y = torch.arange(height, device=depth.device) + 0.5
-    ray_x = ((x - K[:, 0, 2, None]) / K[:, 0, 0, None])[:, None, :]  # [V, 1, w]
-    ray_y = ((y - K[:, 1, 2, None]) / K[:, 1, 1, None])[:, :, None]  # [V, h, 1]
-    carried = torch.full((len(K), NEIGHBOURS, height, width), math.nan, device=depth.device)
+    height, width = group.size
+    carried = torch.full((len(depth), NEIGHBOURS, height, width), math.nan, device=depth.device)
     for other in groups:
         views, slots, members = _pairs(neighbours, other)
         if not views:
             continue
-        pairs = other.viewmat[members].double() @ to_world[views]
-        to_other = pairs.float()[:, :3, :, None, None]  # [pairs, 3, 4, 1, 1]
-        # No matrix product, since TF32 would round it to 10 bits.
-        turned_x = to_other[:, :, 0] * ray_x[views][:, None]
-        turned_y = to_other[:, :, 1] * ray_y[views][:, None]
-        turned = turned_x + turned_y + to_other[:, :, 2]  # [pairs, 3, h, w]
-        point = turned * depth[views] + to_other[:, :, 3]  # In the axes of the other's camera. [pairs, 3, h, w]
-        point_depth = point[:, 2].clamp_min(_TINY)  # [pairs, h, w]
-        other_K = other.K[members]
-        focal = other_K.diagonal(dim1=1, dim2=2)[:, :2, None, None]
-        centre = other_K[:, :2, 2, None, None]
-        places = focal * point[:, :2] / point_depth[:, None] + centre  # px. [pairs, 2, h, w]
-        value, drawn, sees = _read(other, members, places).unbind(dim=1)
+        from_view = other.viewmat[members].double() @ to_world[views]  # [pairs, 4, 4]
+        to_picture = _onto_picture(other)[members] @ from_view[:, :3]
+        point = _transformed(to_picture.float(), points, views)  # [pairs, 3, h, w]
+        point_depth = point[:, 2]
+        places = point[:, :2] / point_depth.clamp_min(_TINY)[:, None]  # [pairs, 2, h, w]
+        grid = places.movedim(1, -1)
+        value, drawn, sees = F.grid_sample(other.planes[members], grid, mode="nearest", align_corners=False).unbind(1)
         # Where nothing is drawn, nothing hides the point.
         known = (point_depth < HIDDEN_DEPTH * drawn) | (drawn == 0)
         known &= sees > 0
-        known &= point[:, 2] > 0
-        known &= depth[views][:, 0] > 0
-        carried[views, slots] = torch.where(known, value, math.nan)
+        known &= point_depth > 0
+        known &= depth[views] > 0
+        carried[views, slots] = value.masked_fill(~known, math.nan)
     return carried
+
+
+def _points_in_camera(
+    group: Group,
+    part: slice,  # V views of the group
+) -> Tensor:
+    """Return the drawn points of views in the axes of their cameras. [V, 3, h, w]"""
+    height, width = group.size
+    depth = group.depth[part]
+    K = group.K[part]
+    x = torch.arange(width, device=depth.device) + 0.5
+    y = torch.arange(height, device=depth.device) + 0.5
+    ray_x = (x - K[:, 0, 2, None]) / K[:, 0, 0, None]  # [V, w]
+    ray_y = (y - K[:, 1, 2, None]) / K[:, 1, 1, None]  # [V, h]
+    return torch.stack([ray_x[:, None] * depth, ray_y[:, :, None] * depth, depth], dim=1)
+
+
+def _onto_picture(group: Group) -> Tensor:
+    """Return matrices from the axes of cameras to homogeneous places in their pictures, whose borders are at −1 and 1.
+
+    Returns:
+        float64 [V, 3, 3]
+    """
+    height, width = group.size
+    to_borders = torch.tensor([[2 / width, 0, -1], [0, 2 / height, -1], [0, 0, 1]], dtype=torch.float64)
+    return to_borders.to(group.K.device) @ group.K.double()
+
+
+def _transformed(
+    matrices: Tensor,  # [pairs, 3, 4]
+    points: Tensor,  # [V, 3, h, w]
+    views: Sequence[int],  # Of each pair its view
+) -> Tensor:
+    """Transform the points of each pair's view by the pair's matrix. [pairs, 3, h, w]
+
+    This is no matrix product, since TF32 would round it to 10 bits.
+    """
+    columns = matrices[..., None, None].unbind(2)  # Four of [pairs, 3, 1, 1]
+    transformed = columns[3]
+    for axis in range(3):
+        transformed = torch.addcmul(transformed, columns[axis], points[views, axis, None])
+    return transformed
 
 
 def _pairs(neighbours: Sequence[Sequence[int]], other: Group) -> tuple[list[int], list[int], list[int]]:
@@ -313,24 +360,6 @@ def _pairs(neighbours: Sequence[Sequence[int]], other: Group) -> tuple[list[int]
     return views, slots, members
 
 
-def _read(
-    group: Group,
-    members: Sequence[int],  # One view of the group for each of N pictures
-    places: Tensor,  # In px [N, 2, h, w]
-) -> Tensor:
-    """Return the difference, the depth and 1 where the photo is valid, of views at places in them. [N, 3, h, w]
-
-    All are 0 outside of the picture. The greatest difference near the place counts, since depth is not exact.
-    """
-    height, width = group.size
-    x = places[:, 0] * (2 / width) - 1
-    y = places[:, 1] * (2 / height) - 1
-    grid = torch.stack([x, y], dim=-1)  # From −1 to 1 between the picture's borders. [N, h, w, 2]
-    nearby = group.greatest_nearby[members]
-    planes = torch.stack([nearby, group.depth[members], group.valid[members].to(nearby)], dim=1)
-    return F.grid_sample(planes, grid, mode="nearest", align_corners=False)
-
-
 def spread(
     excesses: Sequence[Tensor],  # Of all views; NaN where unknown [h, w]
 ) -> Spread:
@@ -346,21 +375,47 @@ def spread(
     return Spread(float(median), float(deviation))
 
 
-def candidates(
-    excesses: Sequence[Tensor],  # Of all views; NaN where unknown [h, w]
+def regions(
+    groups: Sequence[Group],  # All views
+    excesses: Sequence[Tensor],  # Of all views in their order; NaN where unknown [h, w]
     limits: Spread,
-) -> list[int]:
+    threads: int = 1,
+) -> dict[int, NDArray[np.bool_]]:
+    """Return where something moved, of the views in which something did. By view, bool [h, w]
+
+    A region consists of connected weak pixels. Enough of them are strong, and enough of the strong ones differ in
+    structure, not in brightness alone. It is dilated, and its holes are filled. Threads search views side by side.
+    """
+    chosen = _candidates(excesses, limits)
+    found = {}
+    with ThreadPoolExecutor(threads) as pool:
+        for group in groups:
+            height, width = group.size
+            places = [place for place, index in enumerate(group.members) if index in chosen]
+            together = max(_MARKED_TOGETHER // (height * width), 1)
+            for start in range(0, len(places), together):
+                part = places[start : start + together]
+                indices = [group.members[place] for place in part]
+                values = torch.stack([excesses[index] for index in indices])
+                marks = _marks(group, part, values, limits).cpu().numpy()
+                for index, region in zip(indices, pool.map(_region, marks), strict=True):
+                    if region is not None:
+                        found[index] = region
+    return dict(sorted(found.items()))
+
+
+def _candidates(excesses: Sequence[Tensor], limits: Spread) -> set[int]:
     """Return the views that have enough strong pixels for a region.
 
     They are counted together, since a GPU waits wherever a number is read.
     """
     if not len(excesses):
-        return []
+        return set()
     counts = torch.stack([(values > limits.strong).sum() for values in excesses]).tolist()
-    chosen = []
+    chosen = set()
     for index, values in enumerate(excesses):
         if counts[index] >= _smallest(values.numel()):
-            chosen.append(index)
+            chosen.add(index)
     return chosen
 
 
@@ -369,19 +424,36 @@ def _smallest(num_pixels: int) -> float:
     return max(SMALLEST_SHARE * num_pixels, _FEWEST_PIXELS)
 
 
-def region(
-    view: SmallView,
-    values: Tensor,  # Excess of the view; NaN where unknown [h, w]
+def _marks(
+    group: Group,
+    places: Sequence[int],  # V views of the group
+    values: Tensor,  # Their excesses; NaN where unknown [V, h, w]
     limits: Spread,
-) -> NDArray[np.bool_] | None:
-    """Return where something moved in a view; None if nothing did. bool [h, w]
+) -> Tensor:
+    """Mark which pixels are strong, which are weak, and which strong ones differ in structure: a bit each.
 
-    A region consists of connected weak pixels. Enough of them are strong, and enough of the strong ones differ in
-    structure, not in brightness alone. It is dilated, and its holes are filled.
+    The excess is unknown before the sky, for example, which has no depth. There a pixel is weak if its difference is
+    above the view's median by more than the strong limit, so that a region also extends over such pixels.
+
+    Returns:
+        uint8 [V, h, w]
     """
-    marks = _marks(view, values, limits).cpu().numpy()
-    weak = (marks & _WEAK) // _WEAK
-    labels, number = _components(_opened(weak))
+    difference = group.difference[places]
+    known = values.isfinite()
+    strong = known & (values > limits.strong)
+    median = difference.flatten(1).median(dim=1).values[:, None, None]
+    weak_if_unknown = difference > median + limits.strong
+    weak = torch.where(known, values > limits.weak, weak_if_unknown)
+    structural = strong & (group.structure[places] > LEAST_EXCESS)
+    return _STRONG * strong.byte() + _WEAK * weak.byte() + _STRUCTURAL * structural.byte()
+
+
+def _region(
+    marks: NDArray[np.uint8],  # What `_marks` returned, of one view [h, w]
+) -> NDArray[np.bool_] | None:
+    """Return where something moved in a view; None if nothing did. [h, w]"""
+    weak = (marks & _WEAK) > 0
+    labels, number = _components(_opened(weak.view(np.uint8)))
     counts = np.bincount(labels[(marks & _STRONG) > 0], minlength=number)
     structural_counts = np.bincount(labels[(marks & _STRUCTURAL) > 0], minlength=number)
     is_region = (counts >= _smallest(marks.size)) & (structural_counts >= STRUCTURAL_SHARE * counts)
@@ -389,25 +461,6 @@ def region(
     if not is_region.any():
         return None
     return _filled(_dilated(is_region[labels].view(np.uint8)))
-
-
-def _marks(
-    view: SmallView,
-    values: Tensor,  # Excess of the view; NaN where unknown [h, w]
-    limits: Spread,
-) -> Tensor:
-    """Mark which pixels are strong, which are weak, and which strong ones differ in structure: a bit each. uint8 [h, w]
-
-    The excess is unknown before the sky, for example, which has no depth. There a pixel is weak if its difference is
-    above the view's median by more than the strong limit, so that a region also extends over such pixels.
-    """
-    known = values.isfinite()
-    strong = known & (values > limits.strong)
-    median = view.difference.median()
-    weak_if_unknown = view.difference > median + limits.strong
-    weak = torch.where(known, values > limits.weak, weak_if_unknown)
-    structural = strong & (view.structure > LEAST_EXCESS)
-    return _STRONG * strong.byte() + _WEAK * weak.byte() + _STRUCTURAL * structural.byte()
 
 
 def _components(

@@ -18,10 +18,9 @@ from sadgs_ns.geometry import moved
 from sadgs_ns.geometry.moved import (
     SmallView,
     Spread,
-    candidates,
     excesses,
     grouped,
-    region,
+    regions,
     spread,
     surface_points,
     working_size,
@@ -52,6 +51,11 @@ def excess(view: SmallView, others: list[SmallView]) -> Tensor:
     """The excess of a view beyond others."""
     neighbours = [list(range(1, len(others) + 1)), *[[] for _ in others]]
     return excesses(grouped([view, *others]), neighbours)[0]
+
+
+def region(view: SmallView, values: Tensor, limits: Spread) -> NDArray[np.bool_] | None:
+    """Where something moved in a view, given its excess."""
+    return regions(grouped([view]), [values], limits).get(0)
 
 
 def difference(photo: Tensor, drawn: Tensor, valid: Tensor) -> Tensor:
@@ -290,14 +294,38 @@ def test_regions_of_noise_are_those_of_scipy(seed: int):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_only_views_with_enough_strong_pixels_are_candidates():
-    few = torch.zeros(HEIGHT, WIDTH)
-    few[0, :7] = 0.3  # A region has at least .3 % of 2,400 pixels.
-    enough = few.clone()
-    enough[0, 7] = 0.3
+def test_only_views_with_enough_strong_pixels_have_regions():
+    thing = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    thing[10:12, 10:14] = True  # A region has at least .3 % of 2,400 pixels, and opening takes the corners.
+    thing[9:13, 11:13] = True
+    few = torch.where(thing, 0.1, 0.0)
+    few[10, 10:14] = 0.3
+    enough = torch.where(thing, 0.3, 0.0)
     unknown = torch.full((HEIGHT, WIDTH), math.nan)
-    assert candidates([few, enough, unknown], LIMITS) == [1]
-    assert candidates([], LIMITS) == []
+    views = [view_at(0.0, thing), view_at(0.0, thing), view_at(0.0)]
+    found = regions(grouped(views), [few, enough, unknown], LIMITS)
+    assert list(found) == [1]
+    assert regions([], [], LIMITS) == {}
+
+
+def test_regions_of_many_views_are_those_of_each_alone(monkeypatch: pytest.MonkeyPatch):
+    thing = pixels(*THING)
+    views = [
+        view_at(0.0, thing),
+        cropped(view_at(0.0, thing), HEIGHT - 8, WIDTH - 12),
+        view_at(0.0),
+        view_at(0.0, thing),
+    ]
+    values = [view.difference for view in views]
+    together = regions(grouped(views), values, LIMITS, threads=2)
+    monkeypatch.setattr(moved, "_MARKED_TOGETHER", 1)
+    one_by_one = regions(grouped(views), values, LIMITS)
+    assert list(together) == [0, 1, 3] and list(one_by_one) == [0, 1, 3]
+    for index in together:
+        alone = region(views[index], values[index], LIMITS)
+        assert alone is not None
+        np.testing.assert_array_equal(together[index], alone)
+        np.testing.assert_array_equal(one_by_one[index], alone)
 
 
 def test_points_lie_on_what_is_drawn():

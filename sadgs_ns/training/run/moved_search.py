@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import groupby
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from torch import Tensor
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.files import atomic_path
 from sadgs_ns.geometry import moved
-from sadgs_ns.geometry.moved import SmallView, Spread
+from sadgs_ns.geometry.moved import Group, SmallView, Spread
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
@@ -36,7 +36,9 @@ FEWEST_VIEWS = 3
 """Training views from which something can be found: others must deny what one shows."""
 MASKS = "masks"
 """Name of the folder, in a run's, for masks of the photos in which something moved."""
-_DRAWN_TOGETHER = 4  # Views, which take less time than one after another
+_FEWEST_TOGETHER, _MOST_TOGETHER = 4, 16  # Views that are drawn at once, which takes less time than one after another
+_GAUSSIANS_TOGETHER = 2**22  # Gaussians, counted in each view, from which the fewest views are drawn at once
+_PIXELS_TOGETHER = 2**23  # Pixels of photos that are reduced at once, in arrays of 100 MB
 _COVERED = 0.5  # Opacity from which a pixel's depth is that of something
 _VALID = 0.99  # Share of a small pixel that masks must leave
 
@@ -45,10 +47,17 @@ _VALID = 0.99  # Share of a small pixel that masks must leave
 class Verdict:
     """The evidence of all views, and what follows from it."""
 
-    views: list[SmallView]
-    excesses: list[Tensor]  # NaN where unknown. [h, w] each
+    groups: list[Group]
+    excesses: list[Tensor]  # Of all views; NaN where unknown. [h, w] each
     limits: Spread
     regions: dict[int, Tensor]  # By view, 1 where something moved. uint8 [h, w]
+
+    def view(self, index: int) -> SmallView:
+        """Return a training view as it was compared."""
+        for group in self.groups:
+            if index in group.place_of:
+                return group.view(group.place_of[index])
+        raise IndexError(f"there is no view {index}")
 
 
 @lru_cache(maxsize=8)
@@ -86,10 +95,10 @@ class MovedSearch:
         """
         world = self._model.strategy.world
         try:
-            views = self._small_views()
+            groups = self._small_views()
             found: dict[int, Tensor] = {}
             if world.rank == 0:
-                found = verdict(views).regions
+                found = verdict(groups, self._threads).regions
         except torch.cuda.OutOfMemoryError:
             if not world.is_single:  # The others would wait for this one.
                 raise
@@ -100,7 +109,7 @@ class MovedSearch:
         self._cache.forget(self._views.moved.replace(found))
 
     @torch.no_grad()
-    def _small_views(self) -> list[SmallView]:
+    def _small_views(self) -> list[Group]:
         """Draw all training views at working size, and compare them with their photos; only rank 0 returns them."""
         gaussians, _ = self._model.gaussians()
         is_first = self._model.strategy.world.rank == 0
@@ -110,22 +119,27 @@ class MovedSearch:
             colors, depths, cameras = self._draw(gaussians, indices)
             if not is_first:
                 continue
-            size = (cameras.height, cameras.width)
-            small = [self._small_photo(next(photos), size) for _ in indices]
-            small_photos = torch.stack([photo for photo, _ in small])
-            valid = torch.stack([where for _, where in small])
+            data = list(islice(photos, len(indices)))
+            small_photos, valid = self._small_photos(data, (cameras.height, cameras.width))
             differences = moved.difference(small_photos, colors, valid)
             structures = moved.structure(small_photos, colors, valid)
             parts = (differences, structures, depths, valid, cameras.viewmats, cameras.Ks)
             views += [SmallView(*of_view) for of_view in zip(*parts, strict=True)]
-        return views
+        return moved.grouped(views)
 
     def _batches(self) -> Iterator[list[int]]:
         """Yield the training views in their order, as many at once as are drawn together; these have one size."""
+        total = max(self._model.strategy.world.total, 1)
+        together = min(max(_GAUSSIANS_TOGETHER // total, _FEWEST_TOGETHER), _MOST_TOGETHER)
         for _, views in groupby(range(len(self._views)), key=lambda index: self._views.sizes[index]):
             same_size = list(views)
-            for start in range(0, len(same_size), _DRAWN_TOGETHER):
-                yield same_size[start : start + _DRAWN_TOGETHER]
+            for start in range(0, len(same_size), together):
+                yield same_size[start : start + together]
+
+    @property
+    def _threads(self) -> int:
+        """Number of threads that decode images and search regions."""
+        return thread_count(self._views.datamanager.config.max_thread_workers)
 
     def _photos(self) -> Iterator[Mapping[str, Any]]:
         """Yield the datamanager's data of all training views in their order; threads decode compressed images."""
@@ -133,7 +147,7 @@ class MovedSearch:
         if isinstance(images, list):
             yield from images
             return
-        threads = thread_count(self._views.datamanager.config.max_thread_workers)
+        threads = self._threads
         with ThreadPoolExecutor(threads) as pool:
             for start in range(0, len(images), 2 * threads):  # The host may have no room for all.
                 yield from pool.map(images.__getitem__, range(start, min(start + 2 * threads, len(images))))
@@ -178,16 +192,23 @@ class MovedSearch:
         gaussians, _ = self._model.gaussians()
         colors, _, cameras = self._draw(gaussians, [index])
         data = self._views.datamanager.cached_train[index]
-        photo, _ = self._small_photo(data, (cameras.height, cameras.width))
-        return photo, colors[0]
+        photos, _ = self._small_photos([data], (cameras.height, cameras.width))
+        return photos[0], colors[0]
 
-    def _small_photo(self, data: Mapping[str, Any], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-        """Return a photo in [0, 1] [3, h, w], and where no mask hides it, bool [h, w], at a size in px."""
-        photo = _reduced(self._model.photo(data)[..., :3], size)
-        valid = torch.ones(size, dtype=torch.bool, device=photo.device)
-        if "mask" in data:
-            valid = _reduced(data["mask"].to(photo), size)[0] > _VALID
-        return photo, valid
+    def _small_photos(self, data: Sequence[Mapping[str, Any]], size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Return V photos in [0, 1] [V, 3, h, w], and where no mask hides them, bool [V, h, w], at a size in px."""
+        height, width = data[0]["image"].shape[:2]
+        together = max(_PIXELS_TOGETHER // (height * width), 1)
+        photos = []
+        for start in range(0, len(data), together):
+            for same_kind in _of_one_kind(data[start : start + together]):
+                images = torch.stack([view["image"].to(self._model.device) for view in same_kind])
+                photos.append(_reduced(self._model.photo({"image": images}), size))
+        valid = torch.ones((len(data), *size), dtype=torch.bool, device=self._model.device)
+        for place, view in enumerate(data):
+            if "mask" in view:
+                valid[place] = _reduced(view["mask"].to(photos[0])[None], size)[0, 0] > _VALID
+        return torch.cat(photos), valid
 
     def _shared(self, found: Mapping[int, Tensor]) -> dict[int, Tensor]:
         """Return the regions that rank 0 found, in all processes."""
@@ -205,7 +226,7 @@ class MovedSearch:
 
     def evidence(self) -> Verdict:
         """Judge all training views by the present Gaussians, and return the verdict without leaving anything out."""
-        return verdict(self._small_views())
+        return verdict(self._small_views(), self._threads)
 
     def report(self, folder: Path) -> None:
         """Print how much is left out, and write masks of the photos into a run's folder; nothing if nothing moved.
@@ -243,33 +264,46 @@ def common_folder(files: Sequence[Path]) -> Path:
     return Path(os.path.commonpath([file.parent for file in files]))
 
 
-def verdict(views: Sequence[SmallView]) -> Verdict:
-    """Judge views by each other."""
-    groups = moved.grouped(views)
+def verdict(groups: Sequence[Group], threads: int = 1) -> Verdict:
+    """Judge views by each other; threads search regions side by side."""
     points = moved.surface_points(groups)
-    neighbours = [[] for _ in views]
+    num_views = sum(len(group.members) for group in groups)
+    neighbours = [[] for _ in range(num_views)]
     if len(points):
-        viewmats = torch.stack([view.viewmat for view in views]).double()
-        Ks = torch.stack([view.K for view in views]).double()
-        sizes = points.new_tensor([[view.depth.shape[1], view.depth.shape[0]] for view in views])
+        viewmats = points.new_zeros((num_views, 4, 4))
+        Ks = points.new_zeros((num_views, 3, 3))
+        sizes = points.new_zeros((num_views, 2))
+        for group in groups:
+            height, width = group.size
+            viewmats[group.members] = group.viewmat.double()
+            Ks[group.members] = group.K.double()
+            sizes[group.members] = points.new_tensor([width, height])
         chosen = choose_neighbours(viewmats, Ks, sizes, points, moved.NEIGHBOURS).tolist()
         neighbours = [[other for other in row if other >= 0] for row in chosen]
     excesses = moved.excesses(groups, neighbours)
     limits = moved.spread(excesses)
     regions = {}
-    for index in moved.candidates(excesses, limits):
-        region = moved.region(views[index], excesses[index], limits)
-        if region is not None:
-            regions[index] = torch.from_numpy(region.view(np.uint8)).to(points.device)
-    return Verdict(list(views), excesses, limits, regions)
+    for index, region in moved.regions(groups, excesses, limits, threads).items():
+        regions[index] = torch.from_numpy(region.view(np.uint8)).to(points.device)
+    return Verdict(list(groups), excesses, limits, regions)
+
+
+def _of_one_kind(data: Sequence[Mapping[str, Any]]) -> Iterator[list[Mapping[str, Any]]]:
+    """Yield photos in their order, as many at once as have one number of channels and one type."""
+
+    def kind(view: Mapping[str, Any]) -> tuple[int, torch.dtype]:
+        return view["image"].shape[-1], view["image"].dtype
+
+    for _, views in groupby(data, key=kind):
+        yield list(views)
 
 
 def _reduced(
-    image: Tensor,  # Floats [H, W, C]
+    images: Tensor,  # Floats [V, H, W, C]
     size: tuple[int, int],  # Height and width in px
 ) -> Tensor:
-    """Reduce an image to a size. [C, h, w]"""
-    planes = image.movedim(-1, 0)[None]
+    """Reduce images to a size. [V, C, h, w]"""
+    planes = images.movedim(-1, 1)
     if planes.shape[2:] == size:
-        return planes[0]
-    return F.interpolate(planes, size, mode="area")[0]
+        return planes
+    return F.interpolate(planes, size, mode="area")

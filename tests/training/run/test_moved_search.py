@@ -199,8 +199,10 @@ def test_photos_of_several_sizes_are_judged(tmp_path: Path):
     trainer = set_up(config)
     verdict = trainer.pipeline.moved_search.evidence()
     sizes = trainer.pipeline.views.sizes
-    assert [tuple(view.depth.shape) for view in verdict.views] == sizes and len({*sizes}) == 2
-    for view in verdict.views:
+    assert [verdict.view(index).size for index in range(len(sizes))] == sizes
+    assert len({*sizes}) == 2
+    for index in range(len(sizes)):
+        view = verdict.view(index)
         assert not view.valid[:, : view.valid.shape[1] // 2].any() and view.valid[:, -1].all()
 
 
