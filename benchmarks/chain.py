@@ -35,6 +35,8 @@ LOADER = (
 """A program that runs one of the package's commands, which need not be on the PATH."""
 _SCORER = "import sys; sys.argv = sys.argv[1:]; from benchmarks.chain_score import main; main()"
 """A program that writes the score of a file."""
+_GAINS = "import sys; sys.argv = sys.argv[1:]; from benchmarks.held_out_gains import main; main()"
+"""A program that writes the gains of a run's held-out photos."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ class Protocol:
     seeds: list[int]  # Seeds of training
     max_size: int = 1600  # Longest side of images in px, in training and in the comparison
     effort: float = 1.0
+    gains: bool = False
+    """Whether training uses gains of exposure where it varies; a second score then has each photo's gain."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,7 @@ class Chain:
     label: str
     max_size: int
     effort: float
+    gains: bool = False
 
     @property
     def key(self) -> str:
@@ -117,11 +122,17 @@ def run_chain(chain: Chain, work: Path, site: Path | None) -> dict[str, Any]:
     run = work / "out" / "chain" / "sadgs" / "run"
     options = ["--output-dir", str(work / "out"), "--experiment-name", "chain", "--timestamp", "run", "--vis", "none"]
     options += ["--machine.seed", str(chain.seed), "--pipeline.effort", f"{chain.effort:g}", "--data", str(scene)]
+    if chain.gains:
+        options += ["--pipeline.model.exposure", "auto"]
     call("training", "ns-train", "sadgs", *options)
     splat = work / "splat.ply"
     call("export", "sadgs-export", str(run), "--output", str(splat), "--frame", "colmap")
     score = work / "score.json"
     words = ["chain_score", str(scene), str(chain.photos), str(splat), str(score), "--max-size", str(chain.max_size)]
+    if chain.gains:
+        gains = work / "gains.json"
+        run_program(_GAINS, ["held_out_gains", str(run / "config.yml"), str(gains)], work, environment)
+        words += ["--gains", str(gains)]
     run_program(_SCORER, words, work, environment_of(None))
     return {"seconds": seconds, "train_views": train_views, **json.loads(score.read_text())}
 
@@ -178,7 +189,9 @@ class Command(PhotoCommand):
         chains = []
         for seed in protocol.seeds:
             for name in names:
-                chains.append(Chain(name, folders[name], seed, self.label, protocol.max_size, protocol.effort))
+                folder = folders[name]
+                chain = Chain(name, folder, seed, self.label, protocol.max_size, protocol.effort, protocol.gains)
+                chains.append(chain)
         return chains
 
     def __call__(self) -> int:

@@ -12,7 +12,7 @@ import argparse
 import json
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from torch import Tensor
 
 from sadgs_ns.cli import splat_file
 from sadgs_ns.cli.splat_file import Splat, read_splat
+from sadgs_ns.geometry.point_colors import apply_gains
 from sadgs_ns.render.types import Cameras
 
 Array = NDArray[np.float32]
@@ -97,16 +99,31 @@ def model_folder(scene: Path) -> Path:
     return scene / "work" / settings["model"]
 
 
-def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Sequence[str]) -> dict[str, Any]:
-    """Compare held-out photos with the file; `names` are all photos, in the order that decides which are held out.
+def compare(
+    scene: Path,
+    photos: Path,
+    splat: Splat,
+    max_size: int,
+    names: Sequence[str],
+    gains: Mapping[str, Sequence[float]] | None = None,
+) -> dict[str, Any]:
+    """Compare held-out photos with the file.
+
+    Args:
+        scene: What `sadgs-process` made of the photos.
+        photos: Their folder.
+        splat: The file, in the frame of the cameras.
+        max_size: Longest side in px at which they are compared; 0 compares at their own size.
+        names: All photos, in the order that decides which are held out.
+        gains: Factors of a rendering's channels [3] by the names of the scene's images.
 
     Returns:
         `views`: PSNR in dB, SSIM and LPIPS (None without its weights) of each held-out photo by its name; their means
         `psnr`, `ssim` and `lpips`, and `worst`, the least PSNR; the numbers of `photos` and `registered` ones; and the
-        names of those held out that did not register, `missing`.
+        names of those held out that did not register, `missing`. With `gains` also `gain_views`: the same as `views`
+        for renderings at their photo's exposure, as if they were opaque everywhere.
     """
     import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
-    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
 
     from benchmarks.chain import held_out, photo_of
     from benchmarks.evaluate import load_lpips
@@ -118,6 +135,7 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
     if network is not None:
         network.to(device)
     views: dict[str, list[float | None]] = {}
+    gain_views: dict[str, list[float | None]] = {}
     for name in held_out(names):
         if name not in images:
             continue
@@ -125,17 +143,14 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
         photo = read_photo(photos / name, max_size)
         size = (photo.shape[1], photo.shape[0])
         drawn = draw(splat, image.camera, image.cam_from_world().matrix(), size)
-        pair = [torch.from_numpy(pixels).movedim(-1, 0)[None].to(device) for pixels in (drawn, photo)]
-        rendered, truth = pair
-        psnr = float(peak_signal_noise_ratio(rendered, truth, data_range=1.0))
-        ssim: Any = structural_similarity_index_measure(rendered, truth, data_range=1.0, sigma=1.5, kernel_size=11)
-        lpips = None
-        if network is not None:
-            with torch.no_grad():
-                lpips = round(float(network(rendered, truth)), 4)
-        views[name] = [round(psnr, 3), round(float(ssim), 4), lpips]
+        rendered = torch.from_numpy(drawn).to(device)
+        truth = torch.from_numpy(photo).to(device)
+        views[name] = measured(rendered, truth, network)
+        if gains is not None:
+            gain = torch.tensor(gains.get(Path(image.name).name, (1.0, 1.0, 1.0)), device=device)
+            gain_views[name] = measured(apply_gains(rendered, gain).clamp(0, 1), truth, network)
     columns = list(zip(*views.values(), strict=True))
-    return {
+    score = {
         "photos": len(names),
         "registered": len(images),
         "missing": [name for name in held_out(names) if name not in images],
@@ -145,6 +160,28 @@ def compare(scene: Path, photos: Path, splat: Splat, max_size: int, names: Seque
         "lpips": None if network is None else statistics.fmean(columns[2]),
         "worst": min(columns[0]),
     }
+    if gains is not None:
+        score["gain_views"] = gain_views
+    return score
+
+
+@torch.no_grad()
+def measured(
+    rendered: Tensor,  # In [0, 1] [H, W, 3]
+    truth: Tensor,  # In [0, 1] [H, W, 3]
+    network: Any,  # Of LPIPS; None without its weights
+) -> list[float | None]:
+    """Return PSNR in dB, SSIM and LPIPS of a rendering, rounded; LPIPS is None without its network."""
+    from torchmetrics.functional.image import peak_signal_noise_ratio, structural_similarity_index_measure
+
+    rendered = rendered.movedim(-1, 0)[None]
+    truth = truth.movedim(-1, 0)[None]
+    psnr = float(peak_signal_noise_ratio(rendered, truth, data_range=1.0))
+    ssim: Any = structural_similarity_index_measure(rendered, truth, data_range=1.0, sigma=1.5, kernel_size=11)
+    lpips = None
+    if network is not None:
+        lpips = round(float(network(rendered, truth)), 4)
+    return [round(psnr, 3), round(float(ssim), 4), lpips]
 
 
 def main() -> None:
@@ -156,10 +193,14 @@ def main() -> None:
     for name in ("scene", "photos", "splat", "output"):
         parser.add_argument(name, type=Path)
     parser.add_argument("--max-size", type=int, default=1600)
+    parser.add_argument("--gains", type=Path)
     options = parser.parse_args()
+    gains = None
+    if options.gains is not None:
+        gains = json.loads(options.gains.read_text("utf8"))
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     splat = read_splat(options.splat, device)
-    score = compare(options.scene, options.photos, splat, options.max_size, photos_of(options.photos))
+    score = compare(options.scene, options.photos, splat, options.max_size, photos_of(options.photos), gains)
     score["gaussians"] = len(splat.gaussians.means)
     score["megabytes"] = round(options.splat.stat().st_size / 1e6, 1)
     score["gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None

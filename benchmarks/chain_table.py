@@ -32,6 +32,9 @@ def markdown(rows: Sequence[Row], labels: Mapping[str, str] | None = None) -> st
             group = [row for row in here if row["label"] == label]
             if group:
                 lines.append([capture, name, *_cells(group, common)])
+            gained = [{**row, "views": row["gain_views"]} for row in group if "gain_views" in row]
+            if gained:
+                lines.append([capture, f"{name}, at the photo's exposure", *_cells(gained, common)])
     return grid(HEADER, lines, names=2)
 
 

@@ -65,6 +65,13 @@ def test_a_table_compares_views_that_registered_in_all_rows():
     assert new.endswith("| b |")
 
 
+def test_a_run_with_gains_has_a_second_line_for_renderings_at_their_photo_s_exposure():
+    gained = row("gains", 0, {"a": [20.0, 0.5, 0.2]}, gain_views={"a": [23.0, 0.6, 0.1]})
+    plain, at_exposure = chain_table.markdown([gained]).splitlines()[2:]
+    assert "| desk | gains | 16 of 16 | 20.00 | .5000 | .2000 |" in plain
+    assert "| desk | gains, at the photo's exposure | 16 of 16 | 23.00 | .6000 | .1000 |" in at_exposure
+
+
 def test_the_protocol_names_eight_captures():
     protocol = chain.load(Path(chain.__file__).parents[1] / "configs/bench/chain.yaml")
     assert len(protocol.captures) == 8
@@ -172,6 +179,12 @@ def test_the_score_falls_when_the_photos_are_blurred_before_training(tmp_path: P
     assert actual == chain.held_out(names)
     assert scores["sharp"]["registered"] == VIEWS
     assert scores["sharp"]["missing"] == []
+    dark = dict.fromkeys(names, (0.5, 0.5, 0.5))
+    splat = chain_score.read_splat(tmp_path / "sharp.ply", torch.device("cpu"))
+    darker = chain_score.compare(folder, photos, splat, 1600, names, dark)
+    assert darker["views"] == scores["sharp"]["views"]
+    for name, (psnr, *_) in darker["gain_views"].items():
+        assert psnr < darker["views"][name][0] - 3
     assert scores["sharp"]["psnr"] > scores["blurred"]["psnr"] + 0.5
     assert scores["sharp"]["ssim"] > scores["blurred"]["ssim"] + 0.03
 

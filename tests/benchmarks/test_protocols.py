@@ -21,7 +21,7 @@ from benchmarks.protocol import Job, Row, Scene
 from benchmarks.run import build_config
 
 CONFIGS = Path(__file__).parents[2] / "configs/bench"
-OTHERS = ("captures", "chain", "disturbed-cameras", "placing", "seconds")
+OTHERS = ("captures", "chain", "chain-exposure", "disturbed-cameras", "placing", "seconds")
 """The description of the captures, and protocols of `chain`, `cameras` and `seconds`, which begin with photos."""
 PROTOCOLS = sorted(path.stem for path in CONFIGS.glob("*.yaml") if path.stem not in OTHERS)
 OPTIONS = {"colmap_path": "sparse/0", "downscale_factor": 4}
