@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from PIL import Image
 from examples import gallery_page, turn
 from examples.drawn_scene.scene import arc_views
 from sadgs_ns.errors import InputError
+from sadgs_ns.formats import ply
+from sadgs_ns.formats.gaussians import DEFAULTS, Gaussians
 
 POSE = np.array([[1.0, 0, 0, 0.5], [0, 0, -1, -2], [0, 1, 0, 0.3]])
 """A camera that looks along y, with z upwards."""
@@ -102,36 +105,127 @@ def test_wrong_input_is_refused_in_a_sentence(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_gallery_s_page_begins_at_the_drawn_scene_s_first_camera():
+def test_the_page_of_the_drawn_room_begins_at_the_drawn_scene_s_first_camera():
     view = arc_views(9, 320, 240)[0]
-    assert_allclose(gallery_page.START.position, view.position, atol=1e-3)
-    forward = np.subtract(gallery_page.START.target, view.position)
+    start = gallery_page.ROOM.start
+    assert_allclose(start.position, view.position, atol=1e-3)
+    forward = np.subtract(start.target, view.position)
     actual = forward / np.linalg.norm(forward)
     expected = view.rotation[2]
     assert_allclose(actual, expected, atol=1e-3)
-    assert math.tan(math.radians(gallery_page.START.degrees) / 2) == pytest.approx(
-        view.width / 2 / view.focal, abs=1e-3
+    assert math.tan(math.radians(start.degrees) / 2) == pytest.approx(view.width / 2 / view.focal, abs=1e-3)
+
+
+def test_the_page_of_the_building_site_begins_with_a_look_at_the_ground_from_the_side():
+    start = gallery_page.SITE.start
+    forward = np.subtract(start.target, start.position)
+    downward = -forward @ gallery_page.SITE.up / np.linalg.norm(forward)
+    assert math.degrees(math.asin(downward)) == pytest.approx(45, abs=0.1)
+
+
+PAGES = pytest.mark.parametrize("entry", gallery_page.ENTRIES, ids=lambda entry: entry.page)
+
+
+def write_points(path: Path, means: np.ndarray) -> None:
+    """Write a splat of grey Gaussians at positions [N, 3]."""
+    count = len(means)
+    gaussians = Gaussians(
+        means=means.astype(np.float32),
+        scales=np.zeros((count, 3), np.float32),
+        quats=np.tile(np.eye(1, 4, dtype=np.float32), (count, 1)),
+        opacities=np.zeros(count, np.float32),
+        features_dc=np.zeros((count, 3), np.float32),
+        features_rest=np.zeros((count, 0, 3), np.float32),
     )
+    with path.open("wb") as file:
+        ply.write(file, gaussians, DEFAULTS)
 
 
-def test_the_gallery_has_the_link_where_the_page_was_made_and_nothing_where_it_was_not():
+@PAGES
+def test_a_page_is_upright_and_its_camera_sees_in_the_splat_what_it_shall_see(
+    entry: gallery_page.Entry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    written = []
+    monkeypatch.setattr(gallery_page.html, "write", lambda file, *content: written.append(content))
+    position = np.array(entry.start.position)
+    target = np.array(entry.start.target)
+    right = np.cross(target - position, entry.up)
+    right /= np.linalg.norm(right)
+    points = np.array([position, target, target + entry.up, target + right])
+    write_points(tmp_path / entry.splat, points)
+    gallery_page.page_of(entry, tmp_path / entry.splat)
+    gaussians, context = written[0]
+    assert (context.title, context.start.degrees) == (entry.title, entry.start.degrees)
+    position, target, above, beside = gaussians.means
+    assert_allclose(context.start.position, position, atol=1e-5)
+    assert_allclose(context.start.target, target, atol=1e-5)
+    assert_allclose(above - target, [0, 0, 1], atol=1e-3)
+    assert_allclose(beside - target, [1, 0, 0], atol=1e-3)
+    assert target[1] - position[1] > 0.5, "A camera that looks straight down has no heading."
+
+
+@PAGES
+def test_the_gallery_has_the_link_where_the_page_was_made_and_nothing_where_it_was_not(entry: gallery_page.Entry):
     page = SimpleNamespace(file=SimpleNamespace(src_uri=gallery_page.GALLERY))
     text = (Path(__file__).parents[2] / "docs" / gallery_page.GALLERY).read_text("utf8")
-    assert text.count(gallery_page.MARKER) == 1
-    for made, links in (("a page", 1), (None, 0)):
-        files = SimpleNamespace(get_file_from_path=lambda name, made=made: made)
-        actual = gallery_page.on_page_markdown(text, page, None, files).count(gallery_page.LINK)
-        assert actual == links
+    assert text.count(entry.marker) == 1
+    for made in ([], [entry.page]):
+        files = SimpleNamespace(get_file_from_path=lambda name, made=made: name if name in made else None)
+        actual = gallery_page.on_page_markdown(text, page, None, files)
+        assert actual.count("[Turn it with the mouse](") == len(made)
+        assert actual.count(entry.link) == len(made)
 
 
-def test_without_what_makes_pages_the_site_is_built_without_the_page(
+def test_pages_and_their_places_have_names_of_their_own():
+    for attribute in ("splat", "page", "marker", "title"):
+        names = {getattr(entry, attribute) for entry in gallery_page.ENTRIES}
+        assert len(names) == len(gallery_page.ENTRIES)
+
+
+def test_without_what_makes_pages_the_site_is_built_without_the_pages(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ):
-    def refuse(splat: Path) -> bytes:
+    def refuse(entry: gallery_page.Entry, splat: Path) -> bytes:
         raise InputError(f"{splat.name}: there is no Node.js.")
 
     monkeypatch.setattr(gallery_page, "page_of", refuse)
     with caplog.at_level("INFO"):
         actual = gallery_page.on_files([], SimpleNamespace(docs_dir="docs"))
         assert actual == []
-    assert "no page of the drawn room. room.ply: there is no Node.js." in caplog.text
+    for entry in gallery_page.ENTRIES:
+        assert f'no page "{entry.title}". {entry.splat}: there is no Node.js.' in caplog.text
+
+
+class GeneratedFile:
+    """It stands for mkdocs's file, since mkdocs may not be installed."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @staticmethod
+    def generated(config: SimpleNamespace, name: str, content: bytes) -> GeneratedFile:
+        """Return a file of the site."""
+        assert content == b"page"
+        return GeneratedFile(name)
+
+
+@PAGES
+def test_only_the_page_whose_splat_is_missing_is_left_out(
+    entry: gallery_page.Entry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    monkeypatch.setattr(gallery_page.html, "write", lambda file, *content: file.write(b"page"))
+    for name in ("mkdocs", "mkdocs.structure"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    monkeypatch.setitem(sys.modules, "mkdocs.structure.files", SimpleNamespace(File=GeneratedFile))
+    (tmp_path / "figures").mkdir()
+    others = [other for other in gallery_page.ENTRIES if other != entry]
+    for other in others:
+        write_points(tmp_path / "figures" / other.splat, np.zeros((1, 3)))
+    with caplog.at_level("INFO"):
+        files = gallery_page.on_files([], SimpleNamespace(docs_dir=tmp_path))
+    actual = [file.name for file in files]
+    expected = [other.page for other in others]
+    assert actual == expected
+    (message,) = caplog.messages
+    assert message.startswith(f'The gallery has no page "{entry.title}". ')
+    assert f"{entry.splat} cannot be read" in message
