@@ -401,6 +401,28 @@ def test_the_mean_opacity_weighs_in_the_loss_while_densification_runs(
     assert opacities[0] > opacities[1] > opacities[2] > opacities[3]
 
 
+@pytest.mark.parametrize(("degree", "degrees"), [(0, [None] * 5), (1, [0, 1, 1, 1, 1]), (3, [0, 1, 2, 3, 3])])
+def test_the_degree_of_harmonics_rises_by_one_each_iteration_up_to_the_option(
+    degree: int,
+    degrees: list[int | None],
+    colmap: ColmapDataParserConfig,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    config = configure(tmp_path, colmap, iterations=5)
+    config.pipeline.model.sh_degree = degree
+    config.cuda_graphs = False  # A graph would not ask what is replaced below.
+    drawn: list[int | None] = []
+
+    def look(model: SadgsModel, groups: Any, *args: Any) -> Any:
+        drawn.extend(group.options.sh_degree for group in groups)
+        return training_step(model, groups, *args)
+
+    monkeypatch.setattr("sadgs_ns.training.run.trainer.training_step", look)
+    set_up(config).train()
+    assert drawn == degrees
+
+
 def test_sfm_points_start_as_opaque_as_asked_and_no_others(colmap: ColmapDataParserConfig, tmp_path: Path):
     config = configure(tmp_path, colmap)
     config.pipeline.model.initial_opacity = 0.4
