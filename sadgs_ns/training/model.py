@@ -564,8 +564,8 @@ class SadgsModel(SplatfactoModel):
         """Restore what `get_extra_state` saved."""
         self.step = state["step"]
         self.strategy_state = self._on_device(state["strategy_state"])
-        paths = self.strategy_state.get("camera_paths")
-        if paths is not None:
+        paths = self.strategy_state.pop("camera_paths", None)
+        if paths is not None and self.config.clear_paths:
             self.strategy_state["camera_paths"] = CameraPaths(**self._on_device(paths))
         self.average.load_state_dict(state["average"], self.device)
         self.set_exposure(ExposureTable.of(state.get("exposure")))

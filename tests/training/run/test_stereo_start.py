@@ -195,6 +195,9 @@ def test_a_checkpoint_holds_the_paths(config: Any, tmp_path: Path):
     for name, value in vars(paths).items():
         actual = getattr(started.strategy_state["camera_paths"], name)
         assert_close(actual, value, rtol=0, atol=0)
+    started.config.clear_paths = False
+    started.set_extra_state(torch.load(tmp_path / "state", weights_only=True))
+    assert "camera_paths" not in started.strategy_state, "the option turns the pruning off in a resumed run, too"
 
 
 def test_a_negative_number_of_points_is_refused(config: Any):
