@@ -19,7 +19,7 @@ from benchmarks import alignment, protocol, table
 from benchmarks.__main__ import Benchmark
 from benchmarks.evaluate import quality
 from helpers.kill_and_resume import set_up
-from helpers.short_runs import configure, train
+from helpers.short_runs import configure
 from sadgs_ns.geometry.poses import corrected
 from sadgs_ns.render.rasterization import rasterize, viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
@@ -29,16 +29,13 @@ from sadgs_ns.training.run.trainer import SadgsTrainer
 
 
 @pytest.fixture(scope="module")
-def trained(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SadgsTrainer:
-    """A short run on the drawn scene."""
+def started(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> SadgsTrainer:
+    """A run on the drawn scene before its first step: what training makes of it would depend on the processor."""
     from helpers.kill_and_resume import parser_of
 
-    # With few Gaussians the pictures are smooth enough for so short an alignment.
-    thresholds = {"clone_grad2d": 3.75e-4, "split_absgrad2d": 7.5e-4}
-    config = configure(tmp_path_factory.mktemp("aligned"), parser_of(scene), 60, **thresholds)
+    config = configure(tmp_path_factory.mktemp("aligned"), parser_of(scene), 60)
     config.machine.device_type = "cpu"
-    config.pipeline.views_per_iteration = 1
-    trainer = train(config)
+    trainer = set_up(config)
     trainer.pipeline.eval()
     return trainer
 
@@ -63,11 +60,11 @@ def distance(one: Cameras, other: Cameras) -> float:
     return float((one.camera_to_worlds - other.camera_to_worlds).norm())
 
 
-def test_a_disturbed_camera_comes_back_and_no_parameter_changes(trained: SadgsTrainer):
-    model = trained.pipeline.model
-    camera, _ = trained.pipeline.datamanager.fixed_indices_eval_dataloader[0]
+def test_a_disturbed_camera_comes_back_and_no_parameter_changes(started: SadgsTrainer):
+    model = started.pipeline.model
+    camera, _ = started.pipeline.datamanager.fixed_indices_eval_dataloader[0]
     before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, torch.Tensor)}
-    away = disturbed(camera, 1.5, model)
+    away = disturbed(camera, 1.0, model)
     batch = photo_of(model, camera)
     aligned = alignment.align(model, (away, batch))
     assert distance(aligned, camera) < 0.2 * distance(away, camera)
@@ -82,9 +79,9 @@ def test_a_disturbed_camera_comes_back_and_no_parameter_changes(trained: SadgsTr
         assert parameter.grad is None
 
 
-def test_a_camera_that_is_right_stays_or_fits_better(trained: SadgsTrainer):
-    model = trained.pipeline.model
-    views = trained.pipeline.datamanager.fixed_indices_eval_dataloader
+def test_a_camera_that_is_right_stays_or_fits_better(started: SadgsTrainer):
+    model = started.pipeline.model
+    views = started.pipeline.datamanager.fixed_indices_eval_dataloader
     for view in (views[0], views[1]):
         plain = alignment._loss(model, view[0], view[0].camera_to_worlds, view[1]["image"])
         aligned = alignment.align(model, view)
@@ -119,10 +116,10 @@ def splatfacto_of(model: SadgsModel, monkeypatch: pytest.MonkeyPatch) -> Splatfa
     return other.eval()
 
 
-def test_splatfacto_s_cameras_are_aligned_the_same_way(trained: SadgsTrainer, monkeypatch: pytest.MonkeyPatch):
-    model = splatfacto_of(trained.pipeline.model, monkeypatch)
-    camera, _ = trained.pipeline.datamanager.fixed_indices_eval_dataloader[0]
-    away = disturbed(camera, 1.5, model)
+def test_splatfacto_s_cameras_are_aligned_the_same_way(started: SadgsTrainer, monkeypatch: pytest.MonkeyPatch):
+    model = splatfacto_of(started.pipeline.model, monkeypatch)
+    camera, _ = started.pipeline.datamanager.fixed_indices_eval_dataloader[0]
+    away = disturbed(camera, 1.0, model)
     batch = photo_of(model, camera)
     aligned = alignment.align(model, (away, batch))
     assert distance(aligned, camera) < 0.2 * distance(away, camera)
