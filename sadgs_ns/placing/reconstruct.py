@@ -22,7 +22,7 @@ import pycolmap
 
 from sadgs_ns.errors import InputError
 from sadgs_ns.events import progress, span
-from sadgs_ns.placing.adjustment import adjust_robustly, is_firm, refine, settle
+from sadgs_ns.placing.adjustment import adjust_robustly, is_firm, leave_out_unheld, refine, settle
 from sadgs_ns.placing.agreement import most_agreed
 from sadgs_ns.placing.features import LISTED, UNLISTED, extract, rename_images
 from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
@@ -396,6 +396,7 @@ class _Search:
             if best.num_points3D() > 0 and not is_firm(best):
                 settle(best, self.database, options, self.fixed_cameras)
         adjust_robustly(best, self.fixed_cameras, self.held_frames)
+        leave_out_unheld(best, self.held_frames)
         if best.num_points3D() == 0:  # None fits with all parameters.
             return None
         return best

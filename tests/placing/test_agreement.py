@@ -13,7 +13,7 @@ import pytest
 
 from helpers.drawn_photos import VIEWS, WIDTH, draw_photos
 from sadgs_ns.placing import reconstruct
-from sadgs_ns.placing.adjustment import is_firm, settle
+from sadgs_ns.placing.adjustment import is_firm, leave_out_unheld, settle
 from sadgs_ns.placing.agreement import disagreement, most_agreed
 from sadgs_ns.placing.features import extract
 
@@ -190,3 +190,26 @@ def test_settling_brings_back_a_focal_length_and_the_observations(placed: Path, 
     assert camera.mean_focal_length() == pytest.approx(WIDTH, rel=0.02)
     assert slid.compute_num_observations() > 0.95 * count
     assert disagreement(model, slid) < 0.005
+
+
+def keep_observations(model: pycolmap.Reconstruction, image: pycolmap.Image, number: int) -> None:
+    """Take all but some of a photo's observations away."""
+    observed = [place for place, point in enumerate(image.points2D) if point.has_point3D()]
+    for place in observed[number:]:
+        model.delete_observation(image.image_id, place)
+
+
+@pytest.mark.hard_case("a photo that hardly any point holds, as one in which things stand before the rest", "left out")
+def test_a_photo_that_keeps_few_observations_is_left_out_and_others_stay(model: pycolmap.Reconstruction):
+    loose, held, *_ = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    keep_observations(model, loose, 14)
+    keep_observations(model, held, 15)
+    kept = copy.deepcopy(model)
+    leave_out_unheld(kept, [loose.frame_id])
+    assert kept.num_reg_images() == model.num_reg_images(), "photos of an earlier model stay"
+    before = {image.name for image in model.images.values() if image.has_pose}
+    leave_out_unheld(model)
+    after = {image.name for image in model.images.values() if image.has_pose}
+    assert before - after == {loose.name}
+    for point in model.points3D.values():
+        assert all(model.images[element.image_id].has_pose for element in point.track.elements)
