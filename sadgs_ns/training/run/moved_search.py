@@ -36,7 +36,8 @@ FEWEST_VIEWS = 3
 """Training views from which something can be found: others must deny what one shows."""
 MASKS = "masks"
 """Name of the folder, in a run's, for masks of the photos in which something moved."""
-_FEWEST_TOGETHER, _MOST_TOGETHER = 4, 16  # Views that are drawn at once, which takes less time than one after another
+_FEWEST_TOGETHER = 4  # Views that are drawn at once, which takes less time than one after another
+_MOST_TOGETHER = 16
 _GAUSSIANS_TOGETHER = 2**22  # Gaussians, counted in each view, from which the fewest views are drawn at once
 _PIXELS_TOGETHER = 2**23  # Pixels of photos that are reduced at once, in arrays of 100 MB
 _COVERED = 0.5  # Opacity from which a pixel's depth is that of something
@@ -129,8 +130,8 @@ class MovedSearch:
 
     def _batches(self) -> Iterator[list[int]]:
         """Yield the training views in their order, as many at once as are drawn together; these have one size."""
-        total = max(self._model.strategy.world.total, 1)
-        together = min(max(_GAUSSIANS_TOGETHER // total, _FEWEST_TOGETHER), _MOST_TOGETHER)
+        number = max(self._model.num_gaussians, 1)
+        together = min(max(_GAUSSIANS_TOGETHER // number, _FEWEST_TOGETHER), _MOST_TOGETHER)
         for _, views in groupby(range(len(self._views)), key=lambda index: self._views.sizes[index]):
             same_size = list(views)
             for start in range(0, len(same_size), together):
