@@ -147,7 +147,7 @@ def compare(
         truth = torch.from_numpy(photo).to(device)
         views[name] = measured(rendered, truth, network)
         if gains is not None:
-            gain = torch.tensor(gains.get(Path(image.name).name, (1.0, 1.0, 1.0)), device=device)
+            gain = torch.tensor(gains.get(image.name, (1.0, 1.0, 1.0)), device=device)
             gain_views[name] = measured(apply_gains(rendered, gain).clamp(0, 1), truth, network)
     columns = list(zip(*views.values(), strict=True))
     score = {

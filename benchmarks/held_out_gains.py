@@ -15,13 +15,14 @@ from benchmarks.moved import load
 
 
 def gains_of(pipeline: Any) -> dict[str, list[float]]:
-    """Return factors of sRGB's values for each channel [3] by the files' names; none if training used no gains."""
+    """Return factors of sRGB's values for each channel [3] by the images' names; none if training used no gains."""
     gains = {}
+    folder = pipeline.datamanager.config.data / "images"
     files = pipeline.datamanager.eval_dataset.image_filenames
     for file, data in zip(files, pipeline.datamanager.cached_eval, strict=True):
         found = pipeline.model.gain_of_held_out(data)
         if found is not None:
-            gains[Path(file).name] = found.tolist()
+            gains[file.relative_to(folder).as_posix()] = found.tolist()
     return gains
 
 
