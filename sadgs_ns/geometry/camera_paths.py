@@ -16,6 +16,8 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from sadgs_ns.geometry.rigid import camera_centres
+
 REACH = 1.5
 """Reach of the empty space around a path, in near planes. 1 left some of room, and 2 cost a view 2.6 dB."""
 HAZE_LENGTH = 0.1
@@ -54,10 +56,9 @@ class CameraPaths:
         points: Tensor,  # [P, 3]
     ) -> CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
-        rotations = viewmats[:, :3, :3].double().cpu()
-        translations = viewmats[:, :3, 3:].double().cpu()
-        centres = -(rotations.mT @ translations)[..., 0]  # [C, 3]
-        viewing_axes = rotations[:, 2]  # [C, 3]
+        viewmats = viewmats.double().cpu()
+        centres = camera_centres(viewmats)  # [C, 3]
+        viewing_axes = viewmats[:, 2, :3]  # [C, 3]
         reach = REACH * near_plane
         pairs = _connect_neighbours(centres, viewing_axes, near_plane, SAME_PLACE * reach)  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)

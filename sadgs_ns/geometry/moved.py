@@ -24,6 +24,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sadgs_ns.geometry.rigid import inverse_rigid
+
 WORKING_SIDE = 400
 """Longest side in px at which views are compared, a quarter of a photo of 1,600 px. Larger photos are reduced to it."""
 NEIGHBOURS = 6
@@ -218,7 +220,7 @@ def surface_points(groups: Sequence[Group]) -> Tensor:
         ray_x = (x - K[:, 0, 2]) / K[:, 0, 0]  # [V, P]
         ray_y = (y - K[:, 1, 2]) / K[:, 1, 1]
         in_camera = torch.stack([ray_x * depth, ray_y * depth, depth], dim=1)  # [V, 3, P]
-        to_world = group.viewmat.double().inverse()
+        to_world = inverse_rigid(group.viewmat.double())
         in_world = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]  # [V, 3, P]
         points.append(in_world.mT[depth > 0])
     return torch.cat(points)
@@ -277,7 +279,7 @@ def _carried(
     """
     points = _points_in_camera(group, part)  # [V, 3, h, w]
     depth = group.depth[part]
-    to_world = group.viewmat[part].double().inverse()
+    to_world = inverse_rigid(group.viewmat[part].double())
     height, width = group.size
     carried = torch.full((len(depth), NEIGHBOURS, height, width), math.nan, device=depth.device)
     for other in groups:

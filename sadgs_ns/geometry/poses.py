@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sadgs_ns.geometry.rigid import camera_centres
+
 ZERO_DEPTH_SHARE = 1e-3
 """Depths of less than this share of the median do not count: no lens is sharp there, and pixels move without bound."""
 _SERIES_BELOW = 0.05
@@ -173,7 +175,7 @@ def _common_motions(
     The world motion is x → x + ρ × (x − m) + d + λ (x − m) with the mean m of the cameras' centres: ρ, d and λ.
     """
     rotation = viewmats[:, :3, :3]
-    centres = -(rotation.mT @ viewmats[:, :3, 3:])[..., 0]  # [V, 3]
+    centres = camera_centres(viewmats)  # [V, 3]
     arms = centres - centres.mean(dim=0)
     x, y, z = arms.unbind(dim=-1)
     zero = torch.zeros_like(x)

@@ -18,6 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sadgs_ns.geometry.rigid import camera_centres
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.geometry.view_depths import depths_in_views
 
@@ -201,7 +202,7 @@ def _views(pyramids: list[list[Tensor]], viewmats: Tensor, Ks: Tensor, sizes: Te
     depth_ranges = _depth_ranges(depths_in_views(points, *cameras))
     projections = _projections(viewmats, Ks, sizes)
     inverses = projections.inverse()
-    centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
+    centres = camera_centres(viewmats)  # [V, 3]
     views = []
     for v, levels in enumerate(pyramids):
         chosen = [n for n in neighbours[v] if n >= 0]

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from sadgs_ns.geometry.rigid import camera_centres
 from sadgs_ns.geometry.view_depths import depths_in_views
 
 NEIGHBOURS = 4
@@ -36,7 +37,7 @@ def choose_neighbours(
     Returns:
         Indices of views, the best first, and −1 where there are fewer; on the device of the points. int64 [V, count]
     """
-    centres = viewmats.inverse()[:, :3, 3]  # [V, 3]
+    centres = camera_centres(viewmats)  # [V, 3]
     depths = depths_in_views(points, viewmats, Ks, sizes)  # [V, P]
     weight = _pair_weights(centres, Ks, depths, points)
     num_seen = depths.isfinite().sum(dim=1, keepdim=True)  # [V, 1]
