@@ -214,11 +214,9 @@ def surface_points(groups: Sequence[Group]) -> Tensor:
         step = max(height * width // points_per_view, 1)
         chosen = torch.arange(step // 2, height * width, step, device=group.depth.device)
         depth = group.depth.flatten(1)[:, chosen].double()  # [V, P]
-        x = chosen % width + 0.5
-        y = torch.div(chosen, width, rounding_mode="floor") + 0.5
-        K = group.K.double()[:, :, :, None]  # [V, 3, 3, 1]
-        ray_x = (x - K[:, 0, 2]) / K[:, 0, 0]  # [V, P]
-        ray_y = (y - K[:, 1, 2]) / K[:, 1, 1]
+        columns = chosen % width
+        rows = torch.div(chosen, width, rounding_mode="floor")
+        ray_x, ray_y = _rays(columns, rows, group.K.double())  # [V, P] each
         in_camera = torch.stack([ray_x * depth, ray_y * depth, depth], dim=1)  # [V, 3, P]
         to_world = inverse_rigid(group.viewmat.double())
         in_world = to_world[:, :3, :3] @ in_camera + to_world[:, :3, 3:]  # [V, 3, P]
@@ -309,12 +307,23 @@ def _points_in_camera(
     """Return the drawn points of views in the axes of their cameras. [V, 3, h, w]"""
     height, width = group.size
     depth = group.depth[part]
-    K = group.K[part]
-    x = torch.arange(width, device=depth.device) + 0.5
-    y = torch.arange(height, device=depth.device) + 0.5
-    ray_x = (x - K[:, 0, 2, None]) / K[:, 0, 0, None]  # [V, w]
-    ray_y = (y - K[:, 1, 2, None]) / K[:, 1, 1, None]  # [V, h]
+    columns = torch.arange(width, device=depth.device)
+    rows = torch.arange(height, device=depth.device)
+    ray_x, ray_y = _rays(columns, rows, group.K[part])  # [V, w] and [V, h]
     return torch.stack([ray_x[:, None] * depth, ray_y[:, :, None] * depth, depth], dim=1)
+
+
+def _rays(
+    columns: Tensor,  # Of pixels, from 0 [X]
+    rows: Tensor,  # Of pixels, from 0 [Y]
+    K: Tensor,  # Intrinsics of views in px [V, 3, 3]
+) -> tuple[Tensor, Tensor]:
+    """Return x and y at depth 1 of the rays through pixels' centres, in the axes of the cameras. [V, X] and [V, Y]"""
+    x = columns + 0.5
+    y = rows + 0.5
+    ray_x = (x - K[:, 0, 2, None]) / K[:, 0, 0, None]
+    ray_y = (y - K[:, 1, 2, None]) / K[:, 1, 1, None]
+    return ray_x, ray_y
 
 
 def _onto_picture(group: Group) -> Tensor:
