@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks.moved import load
+from benchmarks.trained_run import load_pipeline
 
 
 def gains_of(pipeline: Any) -> dict[str, list[float]]:
@@ -29,7 +29,7 @@ def gains_of(pipeline: Any) -> dict[str, list[float]]:
 def main() -> None:
     """Write the gains of a run as JSON."""
     config, output = sys.argv[1:]
-    pipeline = load(Path(config), None)
+    pipeline = load_pipeline(Path(config))
     Path(output).write_text(json.dumps(gains_of(pipeline)), "utf8")
 
 

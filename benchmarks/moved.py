@@ -27,6 +27,7 @@ from torch import Tensor
 from tyro.conf import Positional
 
 from benchmarks.disturbed import IMAGES, MASKS
+from benchmarks.trained_run import load_pipeline
 
 Mask = NDArray[np.bool_]
 _GAIN = 4  # By which differences are brighter in pictures
@@ -108,18 +109,6 @@ def _grey(values: Tensor) -> NDArray[np.uint8]:
     return _bytes(values.expand(3, -1, -1))
 
 
-def load(config: Path, step: int | None) -> Any:
-    """Return the pipeline of a run, as nerfstudio loads it, at its last checkpoint or that of a step."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    def choose(loaded: Any) -> Any:
-        loaded.load_step = step
-        return loaded
-
-    _, pipeline, _, _ = eval_setup(config, test_mode="test", update_config_callback=choose)
-    return pipeline
-
-
 @dataclass
 class Command:
     """Judge what moved by a checkpoint of a run, and draw the evidence of some photos."""
@@ -134,7 +123,7 @@ class Command:
     """step of the checkpoint; the default is the last (a run keeps more with --save-only-latest-checkpoint False)"""
 
     def __call__(self) -> int:
-        pipeline = load(self.config, self.step)
+        pipeline = load_pipeline(self.config, self.step)
         search = pipeline.moved_search
         verdict = search.evidence()
         limits = verdict.limits
