@@ -152,6 +152,9 @@ def leave_out_unheld(
 ) -> None:
     """Leave out photos that hardly any observation holds in their place, and these observations.
 
+    No adjustment follows: so few wrong observations moved points by .2 px at most in trials on mouse, plush and sceaux
+    and by .9 px on lund, and another adjustment brought none closer by more than .02 px.
+
     Args:
         model: Changed in place.
         fixed_frames: Frames that stay.
