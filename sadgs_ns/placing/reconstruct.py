@@ -29,6 +29,7 @@ from sadgs_ns.placing.intrinsics import few_parameters, free_all_parameters
 from sadgs_ns.placing.joining import join_cameras, join_in_database, same_cameras
 from sadgs_ns.placing.judgement import judge, measure
 from sadgs_ns.placing.matching_ahead import AlikePartners, MatchingAhead, Partners, PlannedPartners
+from sadgs_ns.placing.model_files import check_written
 from sadgs_ns.placing.panoramas import rotations
 from sadgs_ns.placing.photos import empty_folder, in_order
 from sadgs_ns.placing.plan import Matching, Summary
@@ -62,11 +63,6 @@ the two focal lengths: those of lenses and of resized photos differ less, those 
 _SEED_STEP = 1000  # Seeds of one placing lie this far apart, so that those of benchmarks, 0, 1, 2, …, share none
 _DISAGREEMENT = "disagreement.txt"  # File in a model's folder that holds `Measures.disagreement`
 FEW_FEATURES = 500  # Keypoints under which a photo counts as blurred or empty
-_COUNT_BYTES = 8  # A file of COLMAP's binary format begins with the number of its images or points.
-_IMAGE_BYTES = 73  # An image in images.bin, without the letters of its name and without its keypoints
-_KEYPOINT_BYTES = 24  # A keypoint in images.bin
-_POINT_BYTES = 51  # A point in points3D.bin, without its track
-_TRACK_ELEMENT_BYTES = 8  # An observation of a point in points3D.bin
 
 
 def make_model(
@@ -105,7 +101,6 @@ def make_model(
         made = pycolmap.Reconstruction(model)
         with span("scene's files"):
             without_lens = undistortion.write_model(made)
-            check_written(undistortion.folder / "sparse" / "0", made)
             write_transforms(without_lens, undistortion.folder, nerfstudio.result().colmap_to_json)
             if rigs:
                 hold_out_panoramas(undistortion.folder / "transforms.json", rigs)
@@ -456,24 +451,6 @@ def _unrelated(names: Sequence[str], database: Path) -> str:
 def registered_photos(model: pycolmap.Reconstruction) -> set[str]:
     """Return the names of the photos with a pose in a model."""
     return {image.name for image in model.images.values() if image.has_pose}
-
-
-def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Raise OSError if the files of a model are shorter than its content; COLMAP does not say that a disk is full.
-
-    COLMAP must not read the files to check them. In a file that is cut off it takes wrong bytes for a length, and asks
-    for that much memory.
-    """
-    images_size = _COUNT_BYTES
-    for image in model.images.values():
-        if image.has_pose:
-            images_size += _IMAGE_BYTES + len(image.name.encode()) + _KEYPOINT_BYTES * image.num_points2D()
-    points_size = _COUNT_BYTES
-    for point in model.points3D.values():
-        points_size += _POINT_BYTES + _TRACK_ELEMENT_BYTES * point.track.length()
-    for name, size in (("images.bin", images_size), ("points3D.bin", points_size)):
-        if (folder / name).stat().st_size < size:
-            raise OSError(f"{folder} was not written completely: the disk is full")
 
 
 def summarize(

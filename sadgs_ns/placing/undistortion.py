@@ -14,7 +14,7 @@ import copy
 import functools
 import shutil
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, as_completed
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sadgs_ns.events import progress, span
+from sadgs_ns.placing.model_files import check_written, move_keypoints
 from sadgs_ns.placing.photos import threads, threads_in_memory
 
 MOST_SIDE = 32_766  # Longest side in px that OpenCV warps
@@ -81,14 +82,16 @@ class Undistortion:
         self._work = [pool.submit(self._write, image.name, image.camera_id) for image in registered]
 
     def write_model(self, made: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Write the model of the images, given that of the photos, and return it."""
+        """Write the model of the images, given that of the photos, and return it. Raise OSError if the disk is full."""
         cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
         undistorted = {key: pycolmap.undistort_camera(self._options, camera) for key, camera in cameras.items()}
         sparse = self.folder / "sparse" / "0"
         sparse.mkdir(parents=True)
-        model = without_distortion(made, undistorted)
+        model = with_cameras(made, undistorted)
         model.write(sparse)
-        return model
+        check_written(sparse, model)
+        move_keypoints(sparse, cameras, undistorted)
+        return pycolmap.Reconstruction(sparse)
 
     def wait(self) -> None:
         """Wait until all images are written. Raise OSError if one cannot be."""
@@ -203,24 +206,9 @@ def write_grey(
     undistorted.write(target)
 
 
-def without_distortion(made: pycolmap.Reconstruction, cameras: dict[int, pycolmap.Camera]) -> pycolmap.Reconstruction:
-    """Return a copy of a model that has undistorted cameras, and its keypoints where they lie in undistorted images.
-
-    Args:
-        made: The model of the photos; it stays as it is.
-        cameras: The undistorted cameras, by the numbers of those of the photos.
-    """
+def with_cameras(made: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> pycolmap.Reconstruction:
+    """Return a copy of a model that has other cameras, by their numbers; its keypoints stay where they are."""
     model = pycolmap.Reconstruction(made)
-    for image in model.images.values():
-        keypoints = image.points2D
-        if len(keypoints) == 0:
-            continue
-        in_photo = np.array([keypoint.xy for keypoint in keypoints])  # [K, 2]
-        rays = np.asarray(made.cameras[image.camera_id].cam_from_img(in_photo))[:, :2]
-        points = np.c_[rays, np.ones(len(rays))]  # At depth 1 before the camera. [K, 3]
-        in_image = np.asarray(cameras[image.camera_id].img_from_cam(points))  # [K, 2]
-        for keypoint, xy in zip(keypoints, in_image, strict=True):
-            keypoint.xy = xy
     for camera_id, new in cameras.items():
         camera = model.cameras[camera_id]
         camera.model = new.model

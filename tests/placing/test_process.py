@@ -50,12 +50,13 @@ from sadgs_ns.placing.adjustment import adjust_robustly
 from sadgs_ns.placing.colmap import make_model, start_colmap
 from sadgs_ns.placing.conversion import convert_photos, write_masks
 from sadgs_ns.placing.folder import find_source, find_videos, look_into
+from sadgs_ns.placing.model_files import check_written
 from sadgs_ns.placing.options import PlacingOptions
 from sadgs_ns.placing.photos import Photo, photos_by_camera, read_photos
 from sadgs_ns.placing.place import Placed, place_photos
 from sadgs_ns.placing.plan import EXHAUSTIVE_LIMIT, Matching, Summary, choose_matching
 from sadgs_ns.placing.publishing import publish
-from sadgs_ns.placing.reconstruct import check_written, match, sequential_pairs
+from sadgs_ns.placing.reconstruct import match, sequential_pairs
 from sadgs_ns.placing.scene import Scene
 from sadgs_ns.placing.video import count_frames, sharpest_frames, video_frames
 from sadgs_ns.training.config import SadgsDatamanagerConfig

@@ -13,7 +13,7 @@ from PIL import Image
 
 from helpers.drawn_textures import energy, photograph, psnr
 from sadgs_ns.placing import undistortion
-from sadgs_ns.placing.undistortion import read_pixels, warp_of, without_distortion, write_image
+from sadgs_ns.placing.undistortion import Undistortion, read_pixels, warp_of, write_image
 
 WIDTH = 360
 HEIGHT = 240
@@ -156,23 +156,58 @@ def test_images_that_are_not_begun_are_dropped_where_the_files_fail(tmp_path: Pa
     assert len(list((tmp_path / "undistorted/images").glob("*.png"))) <= 1
 
 
-def test_keypoints_of_the_model_move_with_the_images():
+def drawn_model() -> pycolmap.Reconstruction:
+    """Return a model of two cameras and four images: one has no keypoints, and one no pose."""
     made = pycolmap.Reconstruction()
-    camera = lens()
-    made.add_camera_with_trivial_rig(camera)
-    points = np.array([[20.0, 30.0], [300.0, 200.0]])
-    image = pycolmap.Image(name="a.jpg", camera_id=1, image_id=1, keypoints=points)
-    made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    new = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    model = without_distortion(made, {1: new})
-    assert model.cameras[1].model_name == "PINHOLE"
-    assert made.cameras[1].model_name == "OPENCV"
-    rays = np.c_[np.asarray(camera.cam_from_img(points))[:, :2], np.ones(2)]
-    expected = np.asarray(new.img_from_cam(rays))
-    actual = [point.xy for point in model.images[1].points2D]
-    assert_allclose(actual, expected, atol=1e-9)
-    actual = [point.xy for point in made.images[1].points2D]
-    assert_allclose(actual, points)
+    made.add_camera_with_trivial_rig(lens())
+    other = lens(k1=0.05, width=300)
+    other.camera_id = 2
+    made.add_camera_with_trivial_rig(other)
+    keypoints = {
+        1: [[20.0, 30.0], [300.0, 200.0]],
+        2: [],
+        3: [[17.5, 4.25], [150.0, 99.5], [290.0, 3.0]],
+        4: [[1.0, 2.0]],
+    }
+    names = {1: "a.jpg", 2: "rooms/häuser.jpg", 3: "c", 4: "d.jpg"}
+    for number, points in keypoints.items():
+        camera_id = 1 + number % 2
+        places = np.array(points).reshape(-1, 2)
+        image = pycolmap.Image(name=names[number], camera_id=camera_id, image_id=number, keypoints=places)
+        if number == 4:
+            frame = pycolmap.Frame(rig_id=camera_id, frame_id=number)
+            frame.add_data_id(image.data_id)
+            made.add_frame(frame)
+            image.frame_id = number
+            made.add_image(image)
+        else:
+            made.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    track = pycolmap.Track()
+    track.add_element(1, 1)
+    track.add_element(3, 2)
+    made.add_point3D(np.array([0.1, 0.2, 3.0]), track, np.zeros(3, np.uint8))
+    return made
+
+
+def test_keypoints_of_the_model_move_with_the_images(tmp_path: Path):
+    """Each keypoint lies where COLMAP's cameras put it, one after the other."""
+    made = drawn_model()
+    images = Undistortion(tmp_path, tmp_path / "model", 0, ())
+    model = images.write_model(made)
+    assert sorted(model.images) == [1, 2, 3]
+    for number, image in model.images.items():
+        before = made.images[number]
+        camera = made.cameras[before.camera_id]
+        new = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+        assert camera.model_name == "OPENCV"
+        assert model.cameras[image.camera_id].model_name == "PINHOLE"
+        assert image.name == before.name
+        assert image.num_points2D() == before.num_points2D()
+        for keypoint, keypoint_before in zip(image.points2D, before.points2D, strict=True):
+            ray = np.append(np.asarray(camera.cam_from_img(keypoint_before.xy))[:2], 1.0)
+            assert_allclose(keypoint.xy, np.asarray(new.img_from_cam(ray)), atol=1e-9)
+            assert keypoint.point3D_id == keypoint_before.point3D_id
+    assert model.points3D[1].track.length() == 2
 
 
 def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):
