@@ -176,6 +176,22 @@ def test_a_verdict_is_taken_back(clean: Path, tmp_path: Path):
     assert not (trainer.pipeline.structure_cache[0][..., 1] == 255).any()
 
 
+def test_structure_tensors_of_several_views_are_computed_anew_together(clean: Path, tmp_path: Path):
+    """One view has gained a region, one has lost it, and one stays; each has what it would have alone."""
+    trainer = set_up(finding(clean, tmp_path, iterations=4))
+    cache = trainer.pipeline.structure_cache
+    before = [cache[index].clone() for index in range(3)]
+    put_region(trainer)
+    region = torch.zeros((HEIGHT, WIDTH), dtype=torch.uint8)
+    region[:, WIDTH // 2 :] = 1
+    cache.forget(trainer.pipeline.views.moved.replace({1: region}))
+    alone = next(cache.quantized([cache.views.cached(1)]))
+    assert torch.equal(cache[0], before[0])
+    assert torch.equal(cache[1], alone)
+    assert torch.equal(cache[2], before[2])
+    assert not torch.equal(cache[1], before[1])
+
+
 @pytest.mark.hard_case("a GPU's memory that is full while a run looks for what moved", "trains on, with a warning")
 def test_full_memory_ends_no_run(clean: Path, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]):
     def fill(self: MovedSearch) -> None:
