@@ -1,6 +1,6 @@
 # sadgs in a container. In a checkout, and then in the folder that holds PHOTOS:
 #   docker build -t sadgs .
-#   docker run --rm --gpus all -v "$PWD:/data" -v sadgs-cache:/cache sadgs sadgs PHOTOS
+#   docker run --rm --gpus all -v "$PWD:/data" -v sadgs-cache:/cache sadgs sadgs PHOTOS --formats html,ply
 # The host needs NVIDIA's driver and its container toolkit. /cache keeps compiled kernels and downloads for later runs.
 FROM debian:bookworm-slim
 

@@ -226,7 +226,7 @@ class SadgsPipelineConfig(VanillaPipelineConfig):
     model: SadgsModelConfig = field(default_factory=SadgsModelConfig)
     """The Gaussians and their densification."""
     effort: float = 1.0
-    """How much training the capture gets, relative to what its number of views asks for: 0.25, 0.5, 1, 2, 4 or 8.
+    """How much training the capture gets, relative to what its number of views asks for: a number up to 100.
     0.5 is a draft of half as many renderings. 2 renders up to twice as many, of more Gaussians if views are many."""
     views_per_iteration: int | None = None
     """Training views rendered for one optimizer step, at most as many as there are; the loss is their mean.
