@@ -56,9 +56,9 @@ class CameraPaths:
         points: Tensor,  # [P, 3]
     ) -> CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
-        viewmats = viewmats.double().cpu()
-        centres = camera_centres(viewmats)  # [C, 3]
-        viewing_axes = viewmats[:, 2, :3]  # [C, 3]
+        exact = viewmats.double().cpu()
+        centres = camera_centres(exact)  # [C, 3]
+        viewing_axes = exact[:, 2, :3]  # [C, 3]
         reach = REACH * near_plane
         pairs = _connect_neighbours(centres, viewing_axes, near_plane, SAME_PLACE * reach)  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)

@@ -1,7 +1,7 @@
 """A model's files as COLMAP writes them: whether they are whole, and where keypoints lie in them.
 
-pycolmap hands out keypoints one at a time, 240,000 of them for 50 photos. Moving them in the file takes a tenth of the
-time.
+pycolmap hands out keypoints one at a time, 240,000 of them for 50 photos. Moving them in the file takes a fraction of
+the time.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
     """Raise OSError if the files of a model are shorter than its content; COLMAP does not say that a disk is full.
 
     COLMAP must not read the files to check them. In a file that is cut off it takes wrong bytes for a length, and asks
-    for that much memory.
+    for that much memory. Images and points are nearly all of a model, and are written after its cameras and rigs.
     """
     images_size = _COUNT_BYTES
     for image in model.images.values():
@@ -47,12 +47,15 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
 def move_keypoints(folder: Path, before: Mapping[int, pycolmap.Camera], after: Mapping[int, pycolmap.Camera]) -> None:
     """Move the keypoints of a model's file to where cameras without distortion see them.
 
+    Raises OSError if the file cannot be read or written.
+
     Args:
         folder: Holds the model, whole as `check_written` says.
         before: The cameras in which the keypoints lie, by their numbers.
         after: The cameras in which they shall lie.
     """
-    content = np.memmap(folder / IMAGES, np.uint8, "r+")
+    path = folder / IMAGES
+    content = np.fromfile(path, np.uint8)
     position = _COUNT_BYTES
     for _ in range(_number_at(content, 0)):
         camera_id = int(content[position + _CAMERA_OFFSET : position + _NAME_OFFSET].view("<u4")[0])
@@ -67,7 +70,7 @@ def move_keypoints(folder: Path, before: Mapping[int, pycolmap.Camera], after: M
         if count > 0:
             keypoints["xy"] = _seen_by(before[camera_id], after[camera_id], keypoints["xy"])
         position = end
-    content.flush()
+    path.write_bytes(content.data)
 
 
 def _number_at(content: NDArray[np.uint8], position: int) -> int:

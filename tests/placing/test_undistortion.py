@@ -210,6 +210,20 @@ def test_keypoints_of_the_model_move_with_the_images(tmp_path: Path):
     assert model.points3D[1].track.length() == 2
 
 
+def test_a_full_disk_is_told_before_keypoints_are_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    write = pycolmap.Reconstruction.write
+
+    def write_half(self: pycolmap.Reconstruction, folder: Path) -> None:
+        write(self, folder)
+        file = folder / "images.bin"
+        file.write_bytes(file.read_bytes()[:200])
+
+    monkeypatch.setattr(pycolmap.Reconstruction, "write", write_half)
+    images = Undistortion(tmp_path, tmp_path / "model", 0, ())
+    with pytest.raises(OSError, match="the disk is full"):
+        images.write_model(drawn_model())
+
+
 def test_a_jpeg_loses_hardly_anything_and_a_png_nothing(tmp_path: Path):
     pixels = photograph(lens(width=90, height=60), 4.0 / 81)
     for name, most in (("a.jpg", 4.0), ("a.JPEG", 4.0), ("a.png", 0.0)):

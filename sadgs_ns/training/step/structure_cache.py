@@ -54,21 +54,15 @@ class StructureCache:
         """Load the training images, and compute S̄ of all if they are on the device, unless that was done before."""
         if self.filled:
             return
-        images = self.views.datamanager.cached_train  # This loads them.
+        images = self.views.datamanager.cached_train
         if self.views.prefetcher is None:
-            self._compute(range(len(images)))
+            by_size = defaultdict(list)
+            for index, data in enumerate(images):
+                by_size[data["image"].shape[:2]].append(index)
+            for indices in by_size.values():
+                tensors = self.quantized([self.views.cached(index) for index in indices])
+                self._kept.update(zip(indices, tensors, strict=True))
         self.filled = True
-
-    def _compute(self, indices: Iterable[int]) -> None:
-        """Compute and keep S̄ of training images, those of one size together."""
-        by_size = defaultdict(list)
-        for index in indices:
-            data = self.views.cached(index)
-            by_size[data["image"].shape[:2]].append((index, data))
-        for same_size in by_size.values():
-            tensors = self.quantized([data for _, data in same_size])
-            for (index, _), tensor in zip(same_size, tensors, strict=True):
-                self._kept[index] = tensor
 
     def __getitem__(self, index: int) -> Tensor:
         """Quantized S̄ of a training image, on the device. uint8 [H, W, 3]"""
@@ -79,11 +73,12 @@ class StructureCache:
 
     def forget(self, indices: Sequence[int]) -> None:
         """Compute S̄ of some views anew, at once or when it is needed, because their masks have changed."""
-        kept = [index for index in indices if index in self._kept]
-        if self.views.prefetcher is None:
-            self._compute(kept)
-        else:
-            for index in kept:
+        for index in indices:
+            if index not in self._kept:
+                continue
+            if self.views.prefetcher is None:
+                self._kept[index] = next(self.quantized([self.views.cached(index)]))
+            else:
                 del self._kept[index]
 
     def get(self, views: Sequence[tuple[int, Mapping[str, Any]]], world: World) -> list[Tensor]:
