@@ -39,6 +39,7 @@ COMMANDS = {
     "startup": ("startup:Command", "what the code for a quick start brings: the wait for the first step"),
     "hashes": ("hashes:Command", "hashes of what short runs and kernels compute, to compare two commits"),
     "exposures": ("exposures:Command", "a copy of a scene whose photos have known exposures"),
+    "gains": ("known_gains:Command", "how accurately gains of exposure are found, given known ones"),
     "evidence": ("moved:Command", "pictures of what a run finds to have moved, and why"),
     "disturbed": ("disturbed:Command", "copies of scenes in which things stand before some photos, and their masks"),
 }

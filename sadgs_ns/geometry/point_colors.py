@@ -47,12 +47,11 @@ def observe_points(
     viewmat: Tensor,  # world to camera [4, 4]
     K: Tensor,  # px; the centre of the first pixel is (0.5, 0.5) [3, 3]
     points: Tensor,  # world units [Q, 3]
-    visible: bool,  # Whether the photo sees all of them that lie inside; if not, those behind others are left out
 ) -> tuple[Tensor, Tensor]:
     """Find the light of points in a photo, the mean of 3 × 3 pixels.
 
-    Points behind the camera, at the border or outside are left out, and so are those with a pixel that is dark,
-    clipped, masked or transparent.
+    Points behind the camera or other points, at the border or outside are left out, and so are those with a pixel that
+    is dark, clipped, masked or transparent.
 
     Returns:
         Indices of M points, int64 [M], and log₂ of their linear light, float64 [M, 3].
@@ -64,8 +63,7 @@ def observe_points(
     inside = (depth > 0) & (pixels >= 1).all(dim=1)
     inside &= (pixels[:, 0] < width - 1) & (pixels[:, 1] < height - 1)
     indices = inside.nonzero()[:, 0]
-    if not visible:
-        indices = indices[_in_front(pixels[indices], depth[indices], width)]
+    indices = indices[_in_front(pixels[indices], depth[indices], width)]
     columns, rows = pixels[indices].long().unbind(1)
     around = torch.tensor(_AROUND, device=image.device)
     rows = (rows[:, None] + around)[:, :, None]  # [M, 3, 1]

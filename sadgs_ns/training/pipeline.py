@@ -22,7 +22,6 @@ from torch import Tensor
 from sadgs_ns.data.cameras import camera_positions, check_camera_types
 from sadgs_ns.data.checks.capture import findings_of
 from sadgs_ns.data.exif_exposure import exposure_stops, exposures_of
-from sadgs_ns.data.run_frame import POINTS_FILE
 from sadgs_ns.errors import InputError
 from sadgs_ns.geometry.exposure import gains_of_others
 from sadgs_ns.geometry.point_colors import srgb_gains
@@ -138,16 +137,14 @@ class SadgsPipeline(VanillaPipeline):
         """Return a reader of the SfM points' colours in the photos of a split; None if there are no points.
 
         The reader uses the dataset's cameras, which change when images are undistorted: give it images that are loaded.
-        Raises as `PointObservations`.
         """
         if self.model.seed_points is None:
             return None
-        metadata = self.datamanager.train_dataparser_outputs.metadata
         points, _ = self.model.seed_points
         dataset = self.datamanager.eval_dataset
         if split == "train":
             dataset = self.datamanager.train_dataset
-        return PointObservations(points.float(), metadata.get(POINTS_FILE), dataset, self.device)
+        return PointObservations(points.float(), dataset, self.device)
 
     @cached_property
     def _held_out_observations(self) -> PointObservations | None:

@@ -28,7 +28,7 @@ def picture() -> torch.Tensor:
 
 
 def seen(image: torch.Tensor, points: torch.Tensor, mask: torch.Tensor | None = None) -> list[int]:
-    indices, stops = observe_points(image, mask, FACING, K, points, visible=True)
+    indices, stops = observe_points(image, mask, FACING, K, points)
     assert len(stops) == len(indices)
     assert stops.isfinite().all()
     return indices.tolist()
@@ -36,13 +36,13 @@ def seen(image: torch.Tensor, points: torch.Tensor, mask: torch.Tensor | None = 
 
 def test_the_mean_light_of_9_pixels_is_read_where_the_point_lies():
     image = picture()
-    indices, stops = observe_points(image, None, FACING, K, point_at(6.2, 2.9), visible=True)
+    indices, stops = observe_points(image, None, FACING, K, point_at(6.2, 2.9))
     values = image[1:4, 5:8].double() / 255
     light = (((values + OFFSET) / (1 + OFFSET)) ** EXPONENT).mean(dim=(0, 1))
     assert indices.tolist() == [0]
     expected = light.log2()[None]
     assert_close(stops, expected)
-    _, same = observe_points(image / 255, None, FACING, K, point_at(6.2, 2.9), visible=True)
+    _, same = observe_points(image / 255, None, FACING, K, point_at(6.2, 2.9))
     assert_within(same, stops, 1e-6)
 
 
@@ -69,13 +69,12 @@ def test_a_pixel_that_is_clipped_dark_masked_or_transparent_leaves_the_point_out
     assert actual == [0]
 
 
-def test_without_tracks_points_behind_others_are_left_out():
+def test_points_behind_others_are_left_out():
     points = torch.cat(
         [point_at(4.5, 4.5, 2.0), point_at(4.51, 4.51, 2.05), point_at(4.5, 4.5, 4.0), point_at(2.5, 6.5, 4.0)]
     )
-    for visible, expected in ((True, [0, 1, 2, 3]), (False, [0, 1, 3])):
-        indices, _ = observe_points(picture(), None, FACING, K, points, visible=visible)
-        assert indices.tolist() == expected
+    indices, _ = observe_points(picture(), None, FACING, K, points)
+    assert indices.tolist() == [0, 1, 3]
 
 
 def test_gains_of_light_are_affine_maps_of_srgbs_values_but_the_darkest():

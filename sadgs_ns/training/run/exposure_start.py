@@ -9,10 +9,13 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.data.exif_exposure import exposures_of
+from sadgs_ns.data.run_frame import POINTS_FILE
+from sadgs_ns.data.tracks import points_seen
 from sadgs_ns.distributed.world import World
 from sadgs_ns.geometry.exposure import (
     FEWEST_POINTS,
     Exposures,
+    Ints,
     Observations,
     fit_exposures,
     gains_of_others,
@@ -25,10 +28,9 @@ from sadgs_ns.training.run.progress import note, warn
 
 LEAST_DEVIATION = 0.1
 """Standard deviation of the gains, in stops of linear light, from which they are used."""
-LEAST_REDUCTION = 0.1
-LEAST_PROJECTED_REDUCTION = 0.2
-"""Shares by which gains must reduce the median residual of points' colours to be used, with tracks and without.
-Where exposure is fixed, what looks like gains reduces it less."""
+LEAST_REDUCTION = 0.2
+"""Share by which gains must reduce the median residual of points' colours to be used. Where exposure is fixed, what
+looks like gains reduces it less: by 5 or 6 % on two captures."""
 _DISAGREEMENT = 0.5  # Stops by which the ranges of EXIF's exposures and of the gains may differ without a line
 
 
@@ -47,6 +49,7 @@ def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     """Find the gains of the training photos, let the model use them if exposure varies, and print a line about it.
 
     All processes have the gains of the first. It loads the images. Call it before points of stereo depth are added.
+    Raises InputError if the points' file is damaged.
     """
     model = pipeline.model
     if not model.may_use_gains:
@@ -66,7 +69,8 @@ def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     names = photo_names(pipeline.datamanager.train_dataset.image_filenames)
     model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
     if found.observations is not None:
-        means = mean_gains(found.observations, stops.cpu().numpy(), len(points))
+        shown_in, shown = _photos_of_points(pipeline, found.observations)
+        means = mean_gains(shown_in, shown, stops.cpu().numpy(), len(points))
         model.color_points(torch.from_numpy(means).float())
 
 
@@ -122,7 +126,7 @@ def _find(pipeline: SadgsPipeline) -> _Found | None:
         if fitted.known.any():
             if exif_stops is not None:
                 _warn_of_disagreement(fitted, exif_stops)
-            return _by_points(fitted, observations, point_observations.has_tracks)
+            return _by_points(fitted, observations)
     if exif_stops is None:
         return None
     stops = np.array(exif_stops) - np.median(exif_stops)
@@ -134,12 +138,24 @@ def _find(pipeline: SadgsPipeline) -> _Found | None:
     return _Found(stops_of_channels, no_points, None, used, sentence)
 
 
-def _by_points(fitted: Exposures, observations: Observations, has_tracks: bool) -> _Found:
+def _photos_of_points(pipeline: SadgsPipeline, observations: Observations) -> tuple[Ints, Ints]:
+    """Return pairs of a training photo and a point that it shows, whose colour is the mean over these photos. [K], [K]
+
+    They are those of SfM's tracks, or the observations if there are none. Raises InputError as `points_seen`.
+    """
+    source = pipeline.datamanager.train_dataparser_outputs.metadata.get(POINTS_FILE)
+    seen = None
+    if source is not None:
+        seen = points_seen(source, pipeline.datamanager.train_dataset.image_filenames)
+    if seen is None:
+        return observations.views, observations.points
+    views = np.repeat(np.arange(len(seen)), [len(points) for points in seen])
+    return views, np.concatenate(seen)
+
+
+def _by_points(fitted: Exposures, observations: Observations) -> _Found:
     """Decide whether gains that were fitted to points are used."""
-    needed = LEAST_PROJECTED_REDUCTION
-    if has_tracks:
-        needed = LEAST_REDUCTION
-    reduced = fitted.residual_after <= (1 - needed) * fitted.residual_before
+    reduced = fitted.residual_after <= (1 - LEAST_REDUCTION) * fitted.residual_before
     used = fitted.deviation >= LEAST_DEVIATION and reduced
     sentence = _sentence(fitted.deviation, fitted.spread, "by the points' colours", used)
     without = int((~fitted.known).sum())

@@ -5,43 +5,35 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from nerfstudio.data.datasets.base_dataset import InputDataset
-from numpy.typing import NDArray
 from torch import Tensor
 
-from sadgs_ns.data.tracks import points_seen
 from sadgs_ns.geometry.exposure import Observations
 from sadgs_ns.geometry.point_colors import observe_points
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.step.images import LazyImages, thread_count
 
 _MOST_PROJECTED = 1_500_000
-"""Most pairs of points and photos that are tried where no tracks tell which photo sees which point."""
+"""Most pairs of points and photos that are tried."""
 
 
 class PointObservations:
-    """Reads the colours of points [P, 3], in the run's frame, in photos of a dataset. Raises InputError.
+    """Reads the colours of points [P, 3], in the run's frame, in photos of a dataset.
 
-    `source` is the file from which the points were read. If it has tracks, they tell which photo sees which point.
-    Otherwise all points are projected, and those that lie behind others are left out.
+    All points are projected into each photo, and those that lie behind others are left out. SfM's tracks would tell
+    some photos of each point for sure, but they tell too few: known gains were found with half the error from projected
+    points on ten captures (docs/results.md, "Exposure").
     """
 
-    def __init__(self, points: Tensor, source: Path | None, dataset: InputDataset, device: torch.device) -> None:
+    def __init__(self, points: Tensor, dataset: InputDataset, device: torch.device) -> None:
         self.points = points.to(device)
         self.dataset = dataset
-        self.seen: list[NDArray[np.int64]] | None = None
-        if source is not None:
-            self.seen = points_seen(source, dataset.image_filenames)
-
-    @property
-    def has_tracks(self) -> bool:
-        """Whether tracks tell which photo sees which point."""
-        return self.seen is not None
+        every = math.ceil(len(points) * len(dataset) / _MOST_PROJECTED)
+        self._candidates = torch.arange(0, len(points), max(every, 1), device=device)  # Points to look for. int64 [Q]
 
     def of_all(self, images: Sequence[Mapping[str, Any]]) -> Observations:
         """Return the observations in all photos, whose data the datamanager holds."""
@@ -59,7 +51,6 @@ class PointObservations:
 
     def _in_photo(self, index: int, data: Mapping[str, Any]) -> Observations:
         device = self.points.device
-        candidates = self._candidates(index).to(device)
         mask = data.get("mask")
         if mask is not None:
             mask = mask[..., 0].bool().to(device)
@@ -69,18 +60,10 @@ class PointObservations:
             mask,
             viewmats_from_camera_to_world(cameras.camera_to_worlds[index : index + 1])[0].to(device),
             cameras[index].get_intrinsics_matrices().to(device),
-            self.points[candidates],
-            visible=self.has_tracks,
+            self.points[self._candidates],
         )
         views = np.full(len(found), index)
-        return Observations(views, candidates[found].cpu().numpy(), stops.cpu().numpy())
-
-    def _candidates(self, index: int) -> Tensor:
-        """Return the indices of points to look for in a photo. int64 [Q]"""
-        if self.seen is not None:
-            return torch.from_numpy(self.seen[index])
-        every = math.ceil(len(self.points) * len(self.dataset) / _MOST_PROJECTED)
-        return torch.arange(0, len(self.points), max(every, 1))
+        return Observations(views, self._candidates[found].cpu().numpy(), stops.cpu().numpy())
 
 
 def _joined(parts: Sequence[Observations]) -> Observations:
