@@ -1,11 +1,11 @@
 """`python -m benchmarks gains SCENE …`: how accurately gains of exposure are found.
 
-It needs no GPU, and trains nothing. The photos of a scene get known gains in linear light, and are read again. The gains
-that are found then, less those that were found before, should be the known ones, whatever exposure the photos had at
-first. Two kinds are given: `each` photo has a gain of its own (normal, with a standard deviation of .3 stops), or gains
-follow a `slow` wave over all photos in the order of their names, of .4 stops up and down. Every 8th photo from the fifth
-takes no part when gains are fitted. Its own gain is found afterwards by the points' colours, as that of a held-out
-photo.
+It needs no GPU, and trains nothing. The photos of a scene get known gains in linear light, and are read again. The
+gains that are found then, less those that were found before, should be the known ones, whatever exposure the photos had
+at first. Two kinds are given: `each` photo has a gain of its own (normal, with a standard deviation of .3 stops), or
+gains follow a `slow` wave over all photos in the order of their names, of .4 stops up and down. Every 8th photo from
+the fifth takes no part when gains are fitted. Its own gain is found afterwards by the points' colours, as that of a
+held-out photo.
 """
 
 from __future__ import annotations
