@@ -1,4 +1,4 @@
-"""`python -m benchmarks gains SCENE …`: how accurately gains of exposure are found.
+"""`python -m benchmarks gains DATA …`: how accurately gains of exposure are found.
 
 It needs no GPU, and trains nothing. The photos of a scene get known gains in linear light, and are read again. The
 gains that are found then, less those that were found before, should be the known ones, whatever exposure the photos had
