@@ -36,9 +36,8 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
         if image.has_pose:
             name_bytes = len(image.name.encode()) + 1
             images_size += _NAME_OFFSET + name_bytes + _COUNT_BYTES + _KEYPOINT.itemsize * image.num_points2D()
-    points_size = _COUNT_BYTES
-    for point in model.points3D.values():
-        points_size += _POINT_BYTES + _TRACK_ELEMENT_BYTES * point.track.length()
+    points_size = _COUNT_BYTES + _POINT_BYTES * model.num_points3D()
+    points_size += _TRACK_ELEMENT_BYTES * model.compute_num_observations()
     for name, size in ((IMAGES, images_size), (POINTS, points_size)):
         if (folder / name).stat().st_size < size:
             raise OSError(f"{folder} was not written completely: the disk is full")
