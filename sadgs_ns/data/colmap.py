@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import chain
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,8 @@ _CAMERA = struct.Struct("<iiQQ")
 _POSE = struct.Struct("<i7di")
 _POINT = np.dtype([("id", "<u8"), ("position", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _TRACK = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
+KEYPOINT = np.dtype([("place", "<f8", 2), ("point", "<i8")])
+"""A keypoint in an `images.bin`: its place in px, and the id of its point, −1 without."""
 
 
 def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
@@ -109,14 +111,28 @@ def _read_binary_cameras(path: Path) -> Iterator[tuple[int, Camera]]:
         yield camera_id, Camera(model, width, height, params)
 
 
-def _read_binary_poses(path: Path) -> Iterator[tuple[int, Pose]]:
+class Keypoints(NamedTuple):
+    """Where the keypoints of an image lie in an `images.bin`."""
+
+    camera_id: int
+    start: int  # Of the first one, in bytes
+    count: int
+
+
+def _read_binary_images(path: Path) -> Iterator[tuple[int, Pose, Keypoints]]:
     file = _Binary(path)
     for _ in range(file.count()):
         image_id, *pose, camera_id = file.take(_POSE)
         name = file.text()
-        keypoints = file.count()
-        file.skip(24 * keypoints)  # The keypoints are not needed.
-        yield image_id, (name, camera_id, np.array(pose))
+        count = file.count()
+        keypoints = Keypoints(camera_id, file.offset, count)
+        file.skip(KEYPOINT.itemsize * count)
+        yield image_id, (name, camera_id, np.array(pose)), keypoints
+
+
+def _read_binary_poses(path: Path) -> Iterator[tuple[int, Pose]]:
+    for image_id, pose, _ in _read_binary_images(path):
+        yield image_id, pose
 
 
 def _split_binary_points(path: Path) -> tuple[list[bytes], list[bytes]]:
@@ -255,6 +271,12 @@ def read_poses(path: Path) -> list[Pose]:
 def read_image_ids(path: Path) -> dict[int, str]:
     """Return the images' names of an `images.bin` or `images.txt` by their ids; raises as `read_cameras`."""
     return {image_id: name for image_id, (name, _, _) in _read_numbered_poses(path)}
+
+
+def find_keypoints(path: Path) -> list[Keypoints]:
+    """Return where the keypoints of each image lie in an `images.bin`; raises as `read_cameras`."""
+    with _errors_as_sentences(path):
+        return [keypoints for _, _, keypoints in _read_binary_images(path)]
 
 
 def _read_numbered_poses(path: Path) -> list[tuple[int, Pose]]:

@@ -13,16 +13,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-IMAGES = "images.bin"
-"""Name of the file of poses and keypoints."""
-POINTS = "points3D.bin"
-"""Name of the file of points."""
+from sadgs_ns.data.colmap import KEYPOINT, find_keypoints
+
+_IMAGES = "images.bin"
+_POINTS = "points3D.bin"
 _COUNT_BYTES = 8  # A file begins with the number of its images or points.
-_CAMERA_OFFSET = 60  # The number of an image's camera lies here in the image, after its own number and its pose.
-_NAME_OFFSET = 64  # An image's name follows, with a zero byte at its end, then the number of its keypoints.
+_IMAGE_BYTES = 73  # An image in images.bin, without the letters of its name and without its keypoints
 _POINT_BYTES = 51  # A point in points3D.bin, without its track
 _TRACK_ELEMENT_BYTES = 8  # An observation of a point in points3D.bin
-_KEYPOINT = np.dtype([("xy", "<f8", 2), ("point3D_id", "<i8")])
 
 
 def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
@@ -34,11 +32,10 @@ def check_written(folder: Path, model: pycolmap.Reconstruction) -> None:
     images_size = _COUNT_BYTES
     for image in model.images.values():
         if image.has_pose:
-            name_bytes = len(image.name.encode()) + 1
-            images_size += _NAME_OFFSET + name_bytes + _COUNT_BYTES + _KEYPOINT.itemsize * image.num_points2D()
+            images_size += _IMAGE_BYTES + len(image.name.encode()) + KEYPOINT.itemsize * image.num_points2D()
     points_size = _COUNT_BYTES + _POINT_BYTES * model.num_points3D()
     points_size += _TRACK_ELEMENT_BYTES * model.compute_num_observations()
-    for name, size in ((IMAGES, images_size), (POINTS, points_size)):
+    for name, size in ((_IMAGES, images_size), (_POINTS, points_size)):
         if (folder / name).stat().st_size < size:
             raise OSError(f"{folder} was not written completely: the disk is full")
 
@@ -53,28 +50,13 @@ def move_keypoints(folder: Path, before: Mapping[int, pycolmap.Camera], after: M
         before: The cameras in which the keypoints lie, by their numbers.
         after: The cameras in which they shall lie.
     """
-    path = folder / IMAGES
-    content = np.fromfile(path, np.uint8)
-    position = _COUNT_BYTES
-    for _ in range(_number_at(content, 0)):
-        camera_id = int(content[position + _CAMERA_OFFSET : position + _NAME_OFFSET].view("<u4")[0])
-        position += _NAME_OFFSET
-        while content[position] != 0:
-            position += 1
-        position += 1
-        count = _number_at(content, position)
-        position += _COUNT_BYTES
-        end = position + count * _KEYPOINT.itemsize
-        keypoints = content[position:end].view(_KEYPOINT)
+    path = folder / _IMAGES
+    content = bytearray(path.read_bytes())
+    for camera_id, start, count in find_keypoints(path):
         if count > 0:
-            keypoints["xy"] = _seen_by(before[camera_id], after[camera_id], keypoints["xy"])
-        position = end
-    path.write_bytes(content.data)
-
-
-def _number_at(content: NDArray[np.uint8], position: int) -> int:
-    """Return the number of eight bytes at a position."""
-    return int(content[position : position + _COUNT_BYTES].view("<u8")[0])
+            keypoints = np.frombuffer(content, KEYPOINT, count, start)
+            keypoints["place"] = _seen_by(before[camera_id], after[camera_id], keypoints["place"])
+    path.write_bytes(content)
 
 
 def _seen_by(

@@ -82,16 +82,21 @@ class Undistortion:
         self._work = [pool.submit(self._write, image.name, image.camera_id) for image in registered]
 
     def write_model(self, made: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-        """Write the model of the images, given that of the photos, and return it. Raise OSError if the disk is full."""
+        """Write the model of the images, given that of the photos. Raise OSError if the disk is full.
+
+        Returns:
+            The model with the cameras of the images. Its keypoints stay where they are in the photos; those in the file
+            lie where they are in the images.
+        """
         cameras = {image.camera_id: made.cameras[image.camera_id] for image in made.images.values()}
         undistorted = {key: pycolmap.undistort_camera(self._options, camera) for key, camera in cameras.items()}
         sparse = self.folder / "sparse" / "0"
         sparse.mkdir(parents=True)
-        model = with_cameras(made, undistorted)
+        model = _with_cameras(made, undistorted)
         model.write(sparse)
         check_written(sparse, model)
         move_keypoints(sparse, cameras, undistorted)
-        return pycolmap.Reconstruction(sparse)
+        return model
 
     def wait(self) -> None:
         """Wait until all images are written. Raise OSError if one cannot be."""
@@ -206,7 +211,7 @@ def write_grey(
     undistorted.write(target)
 
 
-def with_cameras(made: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> pycolmap.Reconstruction:
+def _with_cameras(made: pycolmap.Reconstruction, cameras: Mapping[int, pycolmap.Camera]) -> pycolmap.Reconstruction:
     """Return a copy of a model that has other cameras, by their numbers; its keypoints stay where they are."""
     model = pycolmap.Reconstruction(made)
     for camera_id, new in cameras.items():

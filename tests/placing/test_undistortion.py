@@ -193,7 +193,8 @@ def test_keypoints_of_the_model_move_with_the_images(tmp_path: Path):
     """Each keypoint lies where COLMAP's cameras put it, one after the other."""
     made = drawn_model()
     images = Undistortion(tmp_path, tmp_path / "model", 0, ())
-    model = images.write_model(made)
+    returned = images.write_model(made)
+    model = pycolmap.Reconstruction(images.folder / "sparse/0")
     assert sorted(model.images) == [1, 2, 3]
     for number, image in model.images.items():
         before = made.images[number]
@@ -208,6 +209,7 @@ def test_keypoints_of_the_model_move_with_the_images(tmp_path: Path):
             assert_allclose(keypoint.xy, np.asarray(new.img_from_cam(ray)), atol=1e-9)
             assert keypoint.point3D_id == keypoint_before.point3D_id
     assert model.points3D[1].track.length() == 2
+    assert {camera.model_name for camera in returned.cameras.values()} == {"PINHOLE"}
 
 
 def test_a_full_disk_is_told_before_keypoints_are_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
