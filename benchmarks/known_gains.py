@@ -76,6 +76,11 @@ def read_scene(scene: Path) -> tuple[Any, torch.Tensor]:
     return InputDataset(outputs), outputs.metadata["points3D_xyz"].float()
 
 
+def held_out_of(views: int) -> NDArray[np.bool_]:
+    """Tell which photos take no part when gains are fitted. [V]"""
+    return np.arange(views) % INTERVAL == VALIDATION
+
+
 def find_gains(dataset: Any, points: torch.Tensor, stops: Array) -> Found:
     """Give the photos of a dataset gains, in stops [V], and find them."""
     from sadgs_ns.training.run.point_observations import PointObservations
@@ -88,7 +93,7 @@ def find_gains(dataset: Any, points: torch.Tensor, stops: Array) -> Found:
         changed = with_gains(pixels[..., :3], np.full(3, 2.0**gain))
         photos.append({**data, "image": torch.from_numpy(changed)})
     observations = PointObservations(points, dataset, points.device).of_all(photos)
-    held_out = np.arange(views) % INTERVAL == VALIDATION
+    held_out = held_out_of(views)
     fitted = fit_exposures(observations.of_views(~held_out), views, len(points))
     others, others_known = gains_of_others(observations.of_views(held_out), fitted.points, views)
     found = np.where(held_out[:, None], others, fitted.stops).mean(axis=1)
@@ -97,7 +102,7 @@ def find_gains(dataset: Any, points: torch.Tensor, stops: Array) -> Found:
 
 def errors(before: Found, after: Found, stops: Array) -> tuple[float, float]:
     """Return the root mean square errors of photos that were fitted, and of those that were held out, in stops."""
-    held_out = np.arange(len(stops)) % INTERVAL == VALIDATION
+    held_out = held_out_of(len(stops))
     known = before.known & after.known
     difference = after.stops - before.stops - stops
     difference -= np.median(difference[known & ~held_out])  # Only gains relative to the median have a meaning.

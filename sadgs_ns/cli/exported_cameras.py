@@ -16,6 +16,7 @@ from sadgs_ns.data.run_cameras import RunCameras
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import atomic_path
 from sadgs_ns.geometry.poses import corrected
+from sadgs_ns.geometry.rigid import inverse_rigid
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 
 _TABLE = "_model.poses.table"
@@ -57,10 +58,9 @@ def refined(
 ) -> Tensor:
     """Return nerfstudio's poses after corrections in the cameras' frames. float64 [C, 3, 4]"""
     viewmats = corrected(viewmats_from_camera_to_world(camera_to_worlds.double()), table.double())
-    rotations = viewmats[:, :3, :3].mT
-    centres = -rotations @ viewmats[:, :3, 3:]
-    flip = rotations.new_tensor([1.0, -1.0, -1.0])
-    return torch.cat([rotations * flip, centres], dim=2)
+    refined_to_worlds = inverse_rigid(viewmats)[:, :3]
+    flip = viewmats.new_tensor([1.0, -1.0, -1.0, 1.0])
+    return refined_to_worlds * flip
 
 
 def _check_images(pipeline: Mapping[str, Any], cameras: RunCameras) -> None:

@@ -25,8 +25,8 @@ class PointObservations:
     """Reads the colours of points [P, 3], in the run's frame, in photos of a dataset.
 
     All points are projected into each photo, and those that lie behind others are left out. SfM's tracks would tell
-    some photos of each point for sure, but they tell too few: known gains were found with half the error from projected
-    points on ten captures (docs/results.md, "Exposure").
+    some photos of each point for sure, but they tell too few: known gains were found with about half the error from
+    projected points on nine of ten captures (docs/results.md, "Exposure").
     """
 
     def __init__(self, points: Tensor, dataset: InputDataset, device: torch.device) -> None:

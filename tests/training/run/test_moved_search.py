@@ -176,7 +176,7 @@ def test_a_verdict_is_taken_back(clean: Path, tmp_path: Path):
     assert not (trainer.pipeline.structure_cache[0][..., 1] == 255).any()
 
 
-def test_structure_tensors_of_several_views_are_computed_anew_together(clean: Path, tmp_path: Path):
+def test_structure_tensors_of_several_views_are_computed_anew(clean: Path, tmp_path: Path):
     """One view has gained a region, one has lost it, and one stays; each has what it would have alone."""
     trainer = set_up(finding(clean, tmp_path, iterations=4))
     cache = trainer.pipeline.structure_cache
