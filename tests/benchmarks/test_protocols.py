@@ -206,14 +206,13 @@ def test_defaults_are_chosen_on_validation_views_and_the_main_table_is_of_test_v
             assert held_out == ({} if scene.name == "lego" else options)
 
 
-def test_the_main_table_has_three_seeds_of_ours_beside_splatfacto():
+def test_the_main_table_has_three_seeds_of_both_methods():
     seeds: dict[tuple[str, str], list[int]] = {}
     for made in load("ours").jobs():
         seeds.setdefault((made.row.label, made.scene.name), []).append(made.seed)
     for scene in load("ours").scenes:
         assert seeds["sadgs", scene] == [0, 1, 2]
-        expected = [0, 1, 2] if scene in ("castle", "fox", "tree") else [0]
-        assert seeds["splatfacto", scene] == expected
+        assert seeds["splatfacto", scene] == [0, 1, 2]
         for label in ("effort 0.5", "effort 4"):
             assert seeds[label, scene] == [0]
 
