@@ -160,7 +160,7 @@ def _by_points(fitted: Exposures, observations: Observations) -> _Found:
     sentence = _sentence(fitted.deviation, fitted.spread, "by the points' colours", used)
     without = int((~fitted.known).sum())
     if used and without:
-        sentence += f" {without} of them share fewer than {FEWEST_POINTS} points with others, and have a gain of 1."
+        sentence += f" Photos that share fewer than {FEWEST_POINTS} points with others have a gain of 1: {without}."
     points = torch.from_numpy(fitted.points).float()
     return _Found(torch.from_numpy(fitted.stops), points, observations, used, sentence)
 
