@@ -84,10 +84,10 @@ class Source:
                 runs.append(Run(scene, name, cell, base, self.megapixels.get(scene)))
         return runs
 
-    def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]]) -> str:
-        """A run a line."""
+    def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]], blanks: bool = False) -> str:
+        """A run a line; with `blanks`, runs may lack numbers of some columns."""
         runs = [run for line in lines for run in self.lines(**line)]
-        return table.of_runs(runs, columns)
+        return table.of_runs(runs, columns, strict=not blanks)
 
     def change(
         self,
