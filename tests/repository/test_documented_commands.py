@@ -43,7 +43,7 @@ else:
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
 OTHER_LANGUAGES = {"python", "text", "yaml", "{button-link}"}
 """Of fenced blocks that hold no commands."""
-FOREIGN = ("git", "cd", "cp", ".", "python3.11 -m venv", "pip install", "ns-install-cli", "docker run")
+FOREIGN = ("git", "cd", "cp", ".", "python3 -m venv", "pip install", "ns-install-cli", "docker run")
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""
 RUN_BY = {
     "make test": ".ci/run",
