@@ -24,7 +24,7 @@ MOST_OBSERVATIONS = 100_000
 """More observations are thinned out evenly, because the time grows with them. Twice as many find known gains no
 better."""
 OBSERVATIONS_OF_A_PHOTO = 200
-"""But as many are kept, on the mean of the photos, where thousands of photos have so many."""
+"""At least so many are kept for each photo on average, which matters from 500 photos on."""
 NOISE = 0.2
 """Stops by which a good observation may be off. One that is farther off counts less the farther it is (Cauchy's
 loss). On the mean of thirteen captures half as much finds known gains as well, and twice as much a fifth worse."""
