@@ -30,7 +30,7 @@ LEAST_DEVIATION = 0.1
 """Standard deviation of the gains, in stops of linear light, from which they are used."""
 LEAST_REDUCTION = 0.2
 """Share by which gains must reduce the median residual of points' colours to be used. Where exposure is fixed, what
-looks like gains reduces it less: by 5 or 6 % on two captures."""
+looks like gains reduces it less: by 6 and 7 % on two captures."""
 _DISAGREEMENT = 0.5  # Stops by which the ranges of EXIF's exposures and of the gains may differ without a line
 
 
