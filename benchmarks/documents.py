@@ -84,10 +84,12 @@ class Source:
                 runs.append(Run(scene, name, cell, base, self.megapixels.get(scene)))
         return runs
 
-    def runs(self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]], blanks: bool = False) -> str:
-        """A run a line; with `blanks`, runs may lack numbers of some columns."""
+    def runs(
+        self, columns: Sequence[str], lines: Sequence[Mapping[str, Any]], may_be_missing: Sequence[str] = ()
+    ) -> str:
+        """A run a line, which may lack the numbers of some columns."""
         runs = [run for line in lines for run in self.lines(**line)]
-        return table.of_runs(runs, columns, strict=not blanks)
+        return table.of_runs(runs, columns, may_be_missing)
 
     def change(
         self,

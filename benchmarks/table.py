@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.results import Result
@@ -277,18 +277,19 @@ _PRINTED = ("scene", "method", "loop", "relative", "matched", "psnr", "median", 
 _PRINTED += ("peak", "seeds")
 
 
-def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) -> str:
+def of_runs(runs: Iterable[Run], columns: Sequence[str], may_be_missing: Collection[str] = ()) -> str:
     """Return a Markdown table with a line for each run and some of COLUMNS.
 
-    A cell of the first column is empty if it would repeat the one above. Raises ValueError if there is no such column,
-    or if a number is missing; without `strict` a missing number is NOTHING.
+    A cell of the first column is empty if it would repeat the one above. A missing number is NOTHING in the columns
+    that `may_be_missing` names. Raises ValueError if one is missing elsewhere, or if there is no such column.
     """
 
-    def cell(column: Callable[[Run], str], run: Run) -> str:
+    def cell(name: str, run: Run) -> str:
+        _, column = COLUMNS[name]
         try:
             return column(run)
         except ValueError:
-            if strict:
+            if name not in may_be_missing:
                 raise
             return NOTHING
 
@@ -296,15 +297,13 @@ def of_runs(runs: Iterable[Run], columns: Sequence[str], strict: bool = True) ->
     if unknown:
         raise ValueError(f"there is no column {', '.join(map(repr, unknown))}; there are {', '.join(COLUMNS)}.")
     header = []
-    functions = []
     for name in columns:
-        title, function = COLUMNS[name]
+        title, _ = COLUMNS[name]
         header.append(title)
-        functions.append(function)
     lines = []
     above = None
     for run in runs:
-        line = [cell(function, run) for function in functions]
+        line = [cell(name, run) for name in columns]
         first = line[0]
         if first == above:
             line[0] = ""
@@ -334,7 +333,7 @@ def markdown(rows: Iterable[Result], reference: str | None = None) -> str:
     if any(row.get("moved_share") is not None for row in last):
         place = columns.index("gaussians")
         columns[place:place] = ["moved_iou", "moved_share", "moved_wrong"]
-    lines = [of_runs(runs, columns, strict=False)]
+    lines = [of_runs(runs, columns, may_be_missing=columns)]
     sentences = [*_spreads_over_scenes(grouped), *_faults(last)]
     if sentences:
         lines.append("")

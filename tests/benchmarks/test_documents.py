@@ -96,6 +96,22 @@ After.
     )
 
 
+def test_runs_may_lack_the_numbers_of_columns_that_are_named_and_of_no_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    rows = [row("fox", "without"), row("fox", "with", gain_psnr=31.0)]
+    lines = [{"rows": "runs.jsonl", "scenes": ["fox"], "labels": {"without": "without", "with": "with"}}]
+    tables = {"main": {"kind": "runs", "columns": ["method", "psnr", "gain_psnr"], "lines": lines}}
+    folder = checkout(tmp_path / "strict", tables, {"runs.jsonl": rows})
+    assert bench.main(["documents", str(folder)]) == 2
+    assert "gain_psnr" in capsys.readouterr().err
+    tables["main"]["may_be_missing"] = ["gain_psnr"]
+    folder = checkout(tmp_path / "named", tables, {"runs.jsonl": rows})
+    assert bench.main(["documents", str(folder)]) == 0
+    written = (folder / "README.md").read_text("utf8")
+    assert "| without | 30.00 | – |\n| with | 30.00 | 31.00 |" in written
+
+
 def test_a_sweep_is_differences_from_its_first_setting(tmp_path: Path):
     folder = checkout(tmp_path, {"sweep": SWEEP}, {"sweep.jsonl": ROWS["sweep.jsonl"]})
     status = bench.main(["documents", str(folder)])
