@@ -27,6 +27,7 @@ from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.run import exposure_start
+from sadgs_ns.training.run.point_observations import PointObservations
 from sadgs_ns.training.run.trainer import SadgsTrainer
 
 WIDTH = 64
@@ -258,3 +259,13 @@ def test_a_line_says_if_exif_and_points_disagree(exposed: Path, tmp_path: Path, 
     assert model.exposure is not None
     actual = model.exposure.stops.mean(dim=1)
     assert_allclose(actual, training_stops(), atol=0.1)
+
+
+@pytest.mark.hard_case("thousands of photos", "10,000 points are looked for in each, if there are so many")
+@pytest.mark.parametrize(
+    ("photos", "points", "tried"), [(100, 3_000, 3_000), (100, 60_000, 15_000), (5_000, 60_000, 10_000)]
+)
+def test_points_are_looked_for_in_all_photos(photos: int, points: int, tried: int):
+    dataset: Any = range(photos)  # Only their number counts.
+    observations = PointObservations(torch.zeros(points, 3), dataset, torch.device("cpu"))
+    assert len(observations._candidates) == tried
