@@ -79,12 +79,10 @@ def fit_exposures(observations: Observations, num_views: int, num_points: int) -
     observations = _thinned(observations, num_views)
     shared, counts = _of_known_photos(observations, num_views, num_points)
     known = counts > 0
-    stops = np.zeros((num_views, 3))
     if not known.any():
-        return Exposures(stops, known, np.full((num_points, 3), np.nan), 0.0, 0.0, 0.0, 0.0)
+        no_gains = np.zeros((num_views, 3))
+        return Exposures(no_gains, known, np.full((num_points, 3), np.nan), 0.0, 0.0, 0.0, 0.0)
     stops = _fitted_gains(shared, num_views)
-    stops -= np.median(stops[known], axis=0)
-    stops[~known] = 0.0
     before = _distances(shared, np.zeros_like(stops), num_points)
     after = _distances(shared, stops, num_points)
     means = stops[known].mean(axis=1)
@@ -118,10 +116,7 @@ def mean_gains(views: Ints, points: Ints, stops: Floats, num_points: int) -> Flo
         num_points: P.
     """
     counts = np.bincount(points, minlength=num_points)
-    columns = []
-    for channel in stops[views].T:
-        columns.append(np.bincount(points, channel, num_points) / np.maximum(counts, 1))
-    return np.stack(columns, axis=1)
+    return _sums(points, stops[views], num_points) / np.maximum(counts, 1)[:, None]
 
 
 def gains_of_others(observations: Observations, points: Floats, num_views: int) -> tuple[Floats, NDArray[np.bool_]]:
@@ -175,6 +170,7 @@ def _shared(observations: Observations, num_points: int) -> Observations:
 def _fitted_gains(observations: Observations, num_views: int) -> Floats:
     """Fit gains to observations, which have at least one photo; log₂ of the gains, 0 for photos without any. [V, 3]
 
+    Each channel's median over the photos with observations is 0.
     The sum of distances has one minimum, so it comes first. From there, Cauchy's loss leaves out what is far off.
     """
     equations = _Equations.of(observations)
@@ -228,24 +224,24 @@ class _Equations:
         by_pair = csr_matrix((weights, (self.rows, self.columns)), shape=self.shape)
         of_points = np.bincount(self.columns, weights, points)
         of_photos = np.bincount(self.rows, weights, photos)
-        means = _weighted_sums(self.columns, weights, self.light, points) / of_points[:, None]
+        means = _sums(self.columns, weights[:, None] * self.light, points) / of_points[:, None]
         differences = self.light - means[self.columns]
-        right_side = _weighted_sums(self.rows, weights, differences, photos)
+        right_side = _sums(self.rows, weights[:, None] * differences, photos)
         through_points = by_pair @ diags(1 / of_points) @ by_pair.T
         matrix = diags((1 + _PULL) * of_photos) - through_points
         gains = splu(matrix.tocsc()).solve(right_side)
         gains -= np.median(gains, axis=0)
-        shift = _weighted_sums(self.columns, weights, gains[self.rows], points) / of_points[:, None]
+        shift = _sums(self.columns, weights[:, None] * gains[self.rows], points) / of_points[:, None]
         residuals = differences - gains[self.rows] + shift[self.columns]
         distances = np.sqrt(np.square(residuals).mean(axis=1))
         return gains, distances
 
 
-def _weighted_sums(segments: Ints, weights: Floats, values: Floats, number: int) -> Floats:
-    """Return the weighted sum of each column of values [K, D] in each of so many segments. [number, D]"""
+def _sums(segments: Ints, values: Floats, number: int) -> Floats:
+    """Return the sum of each column of values [K, D] in each of so many segments. [number, D]"""
     columns = []
     for channel in values.T:
-        columns.append(np.bincount(segments, weights * channel, number))
+        columns.append(np.bincount(segments, channel, number))
     return np.stack(columns, axis=1)
 
 
@@ -258,10 +254,10 @@ def _centres(values: Floats, segments: Ints, number: int) -> Floats:
     for _ in range(STEPS):
         distances = np.sqrt(np.square(values - centres[segments]).mean(axis=1))
         weights = _weights_of_cauchy(distances)
-        sums = np.bincount(segments, weights, number)
-        filled = sums > 0
+        of_segments = np.bincount(segments, weights, number)
+        filled = of_segments > 0
         moved = np.full_like(centres, np.nan)
-        moved[filled] = _weighted_sums(segments, weights, values, number)[filled] / sums[filled][:, None]
+        moved[filled] = _sums(segments, weights[:, None] * values, number)[filled] / of_segments[filled][:, None]
         change = np.abs(moved - centres)[filled].max(initial=0.0)
         centres = moved
         if change < SETTLED:

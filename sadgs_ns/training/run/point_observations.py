@@ -18,9 +18,9 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.training.step.images import LazyImages, thread_count
 
 _MOST_PROJECTED = 1_500_000
-"""Most pairs of points and photos that are tried, …"""
+"""Most pairs of points and photos that are tried, if that leaves `_POINTS_TRIED` points."""
 _POINTS_TRIED = 10_000
-"""… unless that is fewer points than this: of thousands of photos each sees a small share of them."""
+"""So many points are tried in any case, because each of thousands of photos shows a small share of them."""
 
 
 class PointObservations:
