@@ -24,16 +24,10 @@ HAZE_LENGTH = 0.1
 """Haze is longer, in standard deviations, than this share of its distance from a path. .2 left some."""
 SUPPORT = 0.4
 """No point to start from lies within this share of the distance: needles among leaves reach points twice as far."""
-TOO_WIDE = 0.4
-"""Or its second axis is longer than this share: nobody stands so near a surface with a camera."""
-NEIGHBOURS = 4
-"""Each camera has paths to this many others: the nearest ones that look in a similar direction."""
-SIMILAR_DEGREES = 60.0
-"""Largest angle between the viewing axes of two cameras with a path between them."""
-SAME_PLACE = 5e-4
-"""Share of the reach within which cameras stand in one place, such as the parts of a panorama."""
 LONGEST = 20.0
 """Longest path, in near planes or in medians of the distance from a camera to its nearest neighbour."""
+_SAME_PLACE = 5e-4
+"""Share of the reach within which cameras stand in one place, as the parts of a panorama do, but for rounding."""
 _CUBES = 2**12
 """Cubes along each side of a grid, at most; float32 tells them apart."""
 _PAIRS = 2**21
@@ -58,9 +52,8 @@ class CameraPaths:
         """Connect neighbouring cameras, given the scene's near plane > 0 and the points that a run starts from."""
         exact = viewmats.double().cpu()
         centres = camera_centres(exact)  # [C, 3]
-        viewing_axes = exact[:, 2, :3]  # [C, 3]
         reach = REACH * near_plane
-        pairs = _connect_neighbours(centres, viewing_axes, near_plane, SAME_PLACE * reach)  # [E, 2]
+        pairs = _connect_neighbours(centres, near_plane, _SAME_PLACE * reach)  # [E, 2]
         starts, ends = centres[pairs].to(points).unbind(dim=1)
         # `haze` looks at no point farther away.
         nearby = _find_paths(points, starts, ends, (1 + SUPPORT) * reach)
@@ -88,10 +81,7 @@ class CameraPaths:
         from_path = from_path[found]
         from_surface, _ = self.surfaces.query(means[found].cpu().numpy(), workers=-1)
         from_surface = torch.from_numpy(from_surface).to(means)
-        is_alone = from_surface > SUPPORT * from_path
-        second_axes = scales[found].median(dim=1).values
-        is_wide = second_axes > TOO_WIDE * from_path
-        haze[found] = is_alone | is_wide
+        haze[found] = from_surface > SUPPORT * from_path
         return haze
 
     def _distances_from_paths(self, means: Tensor) -> Tensor:
@@ -118,31 +108,41 @@ class CameraPaths:
 
 def _connect_neighbours(
     centres: Tensor,  # float64 [C, 3]
-    viewing_axes: Tensor,  # float64 [C, 3]
     near_plane: float,
     same_place: float,  # distance in world units under which two cameras stand in one place
 ) -> Tensor:
-    """Connect each camera with itself, and with its nearest neighbours that look in a similar direction.
+    """Connect each camera with itself, and two cameras if no third one is nearer to both than they are to each other.
+
+    These pairs are the relative neighbourhood graph: G. T. Toussaint, "The relative neighbourhood graph of a finite
+    planar set", 1980. Paths longer than `LONGEST` are left out.
 
     Returns:
         Pairs of different indices of cameras in ascending order, and (i, i) for each camera; none twice. int64 [E, 2]
     """
-    distances = torch.cdist(centres, centres)  # [C, C]
-    is_unlike = viewing_axes @ viewing_axes.T < math.cos(math.radians(SIMILAR_DEGREES))
-    is_same_place = distances < same_place
-    distances.masked_fill_(is_unlike | is_same_place, torch.inf)
-    distances.fill_diagonal_(torch.inf)
-    nearest = distances.topk(min(NEIGHBOURS, len(centres) - 1), largest=False)
-    median = float(nearest.values[:, :1].median())  # NaN for a single camera
+    # Matrix products would round: cameras near each other would be alike.
+    distances = torch.cdist(centres, centres, compute_mode="donot_use_mm_for_euclid_dist")  # [C, C]
+    is_elsewhere = distances >= same_place
+    to_nearest = distances.masked_fill(~is_elsewhere, torch.inf).amin(dim=1)
+    median = float(to_nearest.median())  # Infinite if all cameras stand in one place
     unit = near_plane
-    if median > near_plane:
+    if near_plane < median < math.inf:
         unit = median
-    longest = LONGEST * unit
-    cameras = torch.arange(len(centres))[:, None]
-    pairs = torch.stack([cameras.expand_as(nearest.indices), nearest.indices], dim=-1)
-    pairs = pairs[nearest.values < longest]
-    pairs = pairs.sort(dim=1).values.unique(dim=0)
-    return torch.cat([cameras.expand(-1, 2), pairs])
+    may_be_path = is_elsewhere & (distances < LONGEST * unit)
+    open_pairs = may_be_path.triu(diagonal=1).nonzero()  # [K, 2]
+    by_distance = distances.argsort(dim=1)  # The cameras from the nearest one of each camera on. [C, C]
+    found = [torch.arange(len(centres))[:, None].expand(-1, 2)]
+    for rank in range(len(centres)):
+        if len(open_pairs) == 0:
+            break
+        first, second = open_pairs.unbind(dim=1)
+        third = by_distance[first, rank]
+        lengths = distances[first, second]
+        # All cameras that are nearer to the first one than the second one is were looked at.
+        is_done = distances[first, third] >= lengths
+        found.append(open_pairs[is_done])
+        is_apart = distances[second, third] >= lengths
+        open_pairs = open_pairs[is_apart & ~is_done]
+    return torch.cat(found)
 
 
 class _NearbyPaths(NamedTuple):
