@@ -48,7 +48,13 @@ def read_photo(file: Path, max_size: int) -> Array:
 
 
 @torch.no_grad()
-def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[int, int]) -> Array:
+def draw(
+    splat: Splat,
+    camera: Any,
+    viewmat: NDArray[np.float64],
+    size: tuple[int, int],
+    gains: Sequence[float] | None = None,
+) -> Array:
     """Draw a splat as a camera of COLMAP sees it, with its distortion.
 
     Args:
@@ -56,6 +62,7 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
         camera: A pycolmap.Camera of the original photo.
         viewmat: World to camera. [3, 4]
         size: Width and height of the result in px.
+        gains: Factors of the channels [3] that give colours the photo's exposure, before they are clamped.
 
     Returns:
         Colours in [0, 1]. [H, W, 3]
@@ -78,7 +85,10 @@ def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[in
     pose = torch.eye(4, device=device)
     pose[:3] = torch.from_numpy(viewmat).to(pose)
     cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
-    pinhole = splat_file.draw(splat, cameras)[0].cpu().numpy()
+    colors, alphas = splat_file.draw_unclamped(splat, cameras)
+    if gains is not None:
+        colors = apply_gains(colors, torch.tensor(gains, device=device), alphas)
+    pinhole = colors.clamp(0, 1)[0].cpu().numpy()
     # OpenCV numbers pixels by their centres.
     at_x = (drawn_x - left - 0.5).astype(np.float32)
     at_y = (drawn_y - top - 0.5).astype(np.float32)
@@ -121,7 +131,7 @@ def compare(
         `views`: PSNR in dB, SSIM and LPIPS (None without its weights) of each held-out photo by its name; their means
         `psnr`, `ssim` and `lpips`, and `worst`, the least PSNR; the numbers of `photos` and `registered` ones; and the
         names of those held out that did not register, `missing`. With `gains` also `gain_views`: the same as `views`
-        for renderings at their photo's exposure, as if they were opaque everywhere.
+        for renderings at their photo's exposure.
     """
     import pycolmap  # Pillow cannot write PNGs if it is loaded after this.
 
@@ -142,13 +152,15 @@ def compare(
         image = images[name]
         photo = read_photo(photos / name, max_size)
         size = (photo.shape[1], photo.shape[0])
-        drawn = draw(splat, image.camera, image.cam_from_world().matrix(), size)
-        rendered = torch.from_numpy(drawn).to(device)
+        viewmat = image.cam_from_world().matrix()
         truth = torch.from_numpy(photo).to(device)
-        views[name] = measured(rendered, truth, network)
+        rendered = draw(splat, image.camera, viewmat, size)
+        views[name] = measured(torch.from_numpy(rendered).to(device), truth, network)
         if gains is not None:
-            gain = torch.tensor(gains.get(image.name, (1.0, 1.0, 1.0)), device=device)
-            gain_views[name] = measured(apply_gains(rendered, gain).clamp(0, 1), truth, network)
+            gained = rendered
+            if image.name in gains:
+                gained = draw(splat, image.camera, viewmat, size, gains[image.name])
+            gain_views[name] = measured(torch.from_numpy(gained).to(device), truth, network)
     columns = list(zip(*views.values(), strict=True))
     score = {
         "photos": len(names),

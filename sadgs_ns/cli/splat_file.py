@@ -60,8 +60,16 @@ def draw_with_opacity(
     splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Draw a splat as `draw`, and return its accumulated opacity [C, height, width, 1], too."""
+    colors, alphas = draw_unclamped(splat, cameras, background, backend)
+    return colors.clamp(0, 1), alphas
+
+
+def draw_unclamped(
+    splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Draw a splat as `draw_with_opacity`, with colours that may be above 1, as an exposure lets them be."""
     options = RenderOptions(sh_degree=splat.degree, backend=backend)
     colors, alphas, _ = rasterize(splat.gaussians, cameras, options)
     if background is not None:
         colors = colors + (1 - alphas) * background
-    return colors.clamp(0, 1), alphas
+    return colors, alphas

@@ -94,6 +94,7 @@ class SadgsModel(SplatfactoModel):
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
         self.exposure: ExposureTable | None = None  # Stored with the extra state, as its size is that of the data
         self.gain_of_held_out: Callable[[Mapping[str, Any]], Tensor | None] = lambda data: None
+        self.camera_of_held_out: Callable[[Mapping[str, Any]], Cameras | None] = lambda data: None
         self.register_buffer("gain_matrices", None, persistent=False)  # Those of `exposure`. [V, 3, 4]
         # An index that is made in a step must be copied to the device in that step.
         self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
@@ -522,7 +523,10 @@ class SadgsModel(SplatfactoModel):
         If training used gains, `gain_psnr` and so on compare the photo with a rendering at its exposure.
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        gained = self.at_exposure_of_photo(outputs, batch)
+        camera = self.camera_of_held_out(batch)
+        gained = None
+        if camera is not None:
+            gained = self.at_exposure_of_photo(camera, batch)
         if gained is not None:
             photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
             predicted = gained.movedim(-1, 0)[None]
@@ -535,20 +539,22 @@ class SadgsModel(SplatfactoModel):
                 del metrics[name]
         return metrics, images
 
-    def at_exposure_of_photo(self, outputs: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor | None:
-        """Return a held-out view's rendering with its photo's gain, or None if training used no gains. [H, W, 3]
+    @torch.no_grad()
+    def at_exposure_of_photo(self, camera: Cameras, batch: Mapping[str, Any]) -> Tensor | None:
+        """Draw a held-out view, camera of shape [1], with its photo's gain; None if training used no gains. [H, W, 3]
 
-        The photo's gain comes from points' colours, not from the rendering.
+        The photo's gain comes from points' colours, not from the rendering. Colours are clamped after it: what a photo
+        shows that is darker than the median may be above 1 at the median exposure.
         """
         if self.exposure is None:
             return None
         gains = self.gain_of_held_out(batch)
         if gains is None:
             return None
-        alpha = outputs["accumulation"]
-        behind = (1 - alpha) * outputs["background"]
-        gained = apply_gains(outputs["rgb"] - behind, gains.to(alpha), alpha)
-        return (gained + behind).clamp(0.0, 1.0)
+        render, alpha, _ = self.render(self.pinhole(camera), self.color_options())
+        gained = apply_gains(render[..., :3], gains.to(alpha), alpha)
+        behind = (1 - alpha) * self.background
+        return (gained + behind).clamp(0.0, 1.0)[0]
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state, the mean of the parameters so far, and the photos' gains."""

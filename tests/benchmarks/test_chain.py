@@ -112,6 +112,26 @@ def test_a_gaussian_is_drawn_where_the_photo_s_distorted_camera_sees_it():
     assert_allclose(found, expected, atol=0.15)
 
 
+def test_an_exposure_shows_what_is_too_bright_at_the_median_one():
+    import pycolmap
+
+    camera = pycolmap.Camera(model="PINHOLE", width=24, height=16, params=[12.0, 12.0, 12.0, 8.0])
+    gaussians = Gaussians(
+        means=torch.tensor([[0.0, 0.0, 1.0]]),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 30.0),
+        opacities=torch.full((1,), 0.999),
+        colors=(torch.full((1, 3), 1.0 / 0.28209479), torch.zeros((1, 0, 3))),  # Harmonics that mean 1.5
+    )
+    splat = chain_score.Splat(gaussians, 0)
+    arguments = (splat, camera, np.eye(3, 4), (24, 16))
+    assert chain_score.draw(*arguments)[8, 12].tolist() == [1, 1, 1]
+    gained = chain_score.draw(*arguments, gains=[0.6, 0.5, 0.4])[8, 12]
+    alpha = 0.999
+    expected = [alpha * (1.5 * k + 0.055 * (k - 1)) for k in (0.6, 0.5, 0.4)]
+    assert_allclose(gained, expected, atol=2e-3)
+
+
 def write_capture(folder: Path, scene: SceneDescription, images: np.ndarray) -> tuple[Path, Path]:
     """Write photos, and a scene of `sadgs-process` that has their cameras alone; return both folders."""
     import pycolmap

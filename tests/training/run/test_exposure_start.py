@@ -92,6 +92,31 @@ def test_photos_of_two_exposures_train_to_the_median_exposure(exposed: Path, tmp
     assert "gain_psnr" not in measured["off"]
 
 
+@pytest.mark.hard_case(
+    "held-out photos that are darker than the median, with things that are too bright at the median exposure",
+    "their rendering gets its exposure before it is clamped",
+)
+def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_path: Path, monkeypatch: Any):
+    monkeypatch.setattr(SadgsModel, "lpips", lambda *_: float("nan"))
+    pipeline = set_up(run_of(exposed, tmp_path)).pipeline
+    pipeline.eval()
+    model = pipeline.model
+    model.gauss_params["features_dc"].data.fill_(1.0 / 0.28209479)  # Harmonics that mean 1.5
+    model.gauss_params["features_rest"].data.zero_()
+    factors = torch.tensor([0.6, 0.5, 0.4])
+    model.gain_of_held_out = lambda data: factors
+    camera, batch = pipeline.datamanager.next_eval(0)
+    outputs = model.get_outputs_for_camera(camera)
+    gained = model.at_exposure_of_photo(camera, batch)
+    assert gained is not None
+    alpha = outputs["accumulation"]
+    assert_allclose(gained, alpha * (1.5 * factors + 0.055 * (factors - 1)), atol=1e-5)
+    batch["image"] = gained
+    metrics, _ = model.get_image_metrics_and_images(outputs, batch)
+    assert metrics["gain_psnr"] > 80
+    assert metrics["psnr"] < 20
+
+
 def test_gains_and_colours_of_points_are_those_that_were_drawn(exposed: Path, tmp_path: Path, capsys: Any):
     model = set_up(run_of(exposed, tmp_path)).pipeline.model
     printed = " ".join(capsys.readouterr().out.split())
