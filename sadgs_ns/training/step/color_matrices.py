@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sadgs_ns.geometry.point_colors import BRIGHTEST
+
 
 def anchored(
     matrices: Tensor,  # [V, 3, 4]
@@ -35,3 +37,19 @@ def correct_colors(
     nothing.
     """
     return render @ matrices[:, None, :, :3].mT + alpha * matrices[:, None, None, :, 3]
+
+
+def excuse_clipped(
+    render: Tensor,  # at the exposure of its photo, not clamped [..., 3]
+    photo: Tensor,  # uint8, or floats in [0, 1] [..., 3]
+) -> Tensor:
+    """Return a rendering with the photo's values wherever the photo is clipped and the rendering is brighter. [..., 3]
+
+    A clipped pixel tells only that the scene is no darker. Its loss, and the gradient of a brighter rendering, is 0.
+    Otherwise long exposures would darken the sky that short ones show as it is.
+    """
+    values = photo
+    if photo.dtype == torch.uint8:
+        values = photo / 255
+    is_excused = (values > BRIGHTEST) & (render > values)
+    return torch.where(is_excused, values, render)

@@ -19,7 +19,7 @@ from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.step.color_matrices import correct_colors
+from sadgs_ns.training.step.color_matrices import correct_colors, excuse_clipped
 from sadgs_ns.training.step.images import stack, stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
 from sadgs_ns.training.step.row_adam import RowUpdate
@@ -149,8 +149,10 @@ def _render_and_compare(
                     view_ids = view_ids[band.view : band.view + 1]
                 colors = correct_colors(colors, alphas, model.view_matrices(leaves, view_ids))
             rgb = model.before_background(colors, alphas, model.background)
-            pair = model.masked_pair(rgb, group.batch(band), model.background)
-            loss, quality, views = _compare(pair, group, band, model.config.ssim_lambda, penalty)
+            rgb, photo = model.masked_pair(rgb, group.batch(band), model.background)
+            if model.exposure is not None:
+                rgb = excuse_clipped(rgb, photo)
+            loss, quality, views = _compare((rgb, photo), group, band, model.config.ssim_lambda, penalty)
             if views != num_views:
                 loss = views / num_views * loss
                 quality = views / num_views * quality
