@@ -112,7 +112,7 @@ def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_
     alpha = outputs["accumulation"]
     assert_allclose(gained, alpha * (1.5 * factors + 0.055 * (factors - 1)), atol=1e-5)
     batch["image"] = gained
-    metrics, _ = model.get_image_metrics_and_images(outputs, batch)
+    metrics, _ = model.get_image_metrics_and_images(dict(outputs), batch)
     assert metrics["gain_psnr"] > 80
     assert metrics["psnr"] < 20
 
