@@ -64,7 +64,8 @@ def render(model: Any, view: View) -> tuple[dict[str, Tensor], Tensor]:
     if getattr(model.config, "color_corrected_metrics", False):
         images["cc_"] = color_correct(images[""], truth)
     if getattr(model, "exposure", None) is not None:  # Models of other methods have none.
-        images["gain_"] = model.at_exposure_of_photo(camera, batch)
+        colors, alpha = model.draw_unclamped(camera)
+        images["gain_"] = model.at_exposure_of_photo(colors, alpha, batch)
     return {prefix: _as_batch(image) for prefix, image in images.items() if image is not None}, _as_batch(truth)
 
 

@@ -16,7 +16,7 @@ from sadgs_ns.training.run.deferred_imports import import_nerfstudio
 import_nerfstudio()  # It precedes what imports nerfstudio, and takes half the time.
 
 from sadgs_ns.cli.inspection import load_run  # noqa: E402
-from sadgs_ns.cli.splat_file import draw_with_opacity, read_splat  # noqa: E402
+from sadgs_ns.cli.splat_file import draw_unclamped, read_splat  # noqa: E402
 from sadgs_ns.errors import InputError  # noqa: E402
 from sadgs_ns.events import progress  # noqa: E402
 from sadgs_ns.training.pipeline import SadgsPipeline  # noqa: E402
@@ -56,11 +56,10 @@ def measure(run: Path, data: Path, file: Path) -> list[str]:
     for index in range(len(views)):
         progress(STAGE, index, len(views))
         camera, batch = views[index]
-        outputs = model.get_outputs_for_camera(camera)
-        of_run.append(_measure_view(pipeline, outputs["rgb"], outputs["accumulation"], batch))
-        pinhole = model.pinhole(camera)
-        drawn, alpha = draw_with_opacity(splat, pinhole, model.background, model.config.backend)
-        of_file.append(_measure_view(pipeline, drawn[0], alpha[0], batch))
+        colors, alpha = model.draw_unclamped(camera)
+        of_run.append(measure_view(pipeline, colors, alpha, batch))
+        drawn, opacity = draw_unclamped(splat, model.pinhole(camera), backend=model.config.backend)
+        of_file.append(measure_view(pipeline, drawn[0], opacity[0], batch))
     return describe(names, of_run, of_file, file.name)
 
 
@@ -73,12 +72,19 @@ def _names_of_views(pipeline: SadgsPipeline) -> list[str]:
     return [os.path.relpath(path, common) for path in held_out]
 
 
-def _measure_view(pipeline: SadgsPipeline, drawn: Tensor, alpha: Tensor, batch: dict[str, Any]) -> Measures:
-    """Compare a drawn view, [H, W, 3] in [0, 1], and its opacity [H, W, 1] with its photo."""
+def measure_view(
+    pipeline: SadgsPipeline,
+    colors: Tensor,  # Without background, not clamped [H, W, 3]
+    alpha: Tensor,  # Opacity [H, W, 1]
+    batch: dict[str, Any],
+) -> Measures:
+    """Compare a drawn view with its photo."""
     model = pipeline.model
-    outputs = {"rgb": drawn, "accumulation": alpha, "background": model.background.expand(drawn.shape)}
+    rgb = (colors + (1 - alpha) * model.background).clamp(0, 1)
+    outputs = {"rgb": rgb, "accumulation": alpha, "background": model.background.expand_as(rgb)}
     measures, _ = model.get_image_metrics_and_images(outputs, batch)
-    return measures
+    # Those at the photo's exposure were of the run's own view.
+    return measures | model.gain_metrics(colors, alpha, batch)
 
 
 def describe(names: Sequence[str], of_run: Sequence[Measures], of_file: Sequence[Measures], file: str) -> list[str]:

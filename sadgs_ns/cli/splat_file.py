@@ -52,24 +52,19 @@ def draw(
     Returns:
         Colours in [0, 1]. [C, height, width, 3]
     """
-    colors, _ = draw_with_opacity(splat, cameras, background, backend)
-    return colors
-
-
-def draw_with_opacity(
-    splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw a splat as `draw`, and return its accumulated opacity [C, height, width, 1], too."""
-    colors, alphas = draw_unclamped(splat, cameras, background, backend)
-    return colors.clamp(0, 1), alphas
-
-
-def draw_unclamped(
-    splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw a splat as `draw_with_opacity`, with colours that may be above 1, as an exposure lets them be."""
-    options = RenderOptions(sh_degree=splat.degree, backend=backend)
-    colors, alphas, _ = rasterize(splat.gaussians, cameras, options)
+    colors, alphas = draw_unclamped(splat, cameras, backend)
     if background is not None:
         colors = colors + (1 - alphas) * background
+    return colors.clamp(0, 1)
+
+
+def draw_unclamped(splat: Splat, cameras: Cameras, backend: BackendName = "auto") -> tuple[torch.Tensor, torch.Tensor]:
+    """Draw a splat as `draw`, without background.
+
+    Returns:
+        Colours that may be above 1, as photos that are darker than the splat's exposure show [C, height, width, 3], and
+        accumulated opacity [C, height, width, 1].
+    """
+    options = RenderOptions(sh_degree=splat.degree, backend=backend)
+    colors, alphas, _ = rasterize(splat.gaussians, cameras, options)
     return colors, alphas

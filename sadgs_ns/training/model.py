@@ -523,38 +523,67 @@ class SadgsModel(SplatfactoModel):
         If training used gains, `gain_psnr` and so on compare the photo with a rendering at its exposure.
         """
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        camera = self.camera_of_held_out(batch)
-        gained = None
-        if camera is not None:
-            gained = self.at_exposure_of_photo(camera, batch)
-        if gained is not None:
-            photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-            predicted = gained.movedim(-1, 0)[None]
-            truth = photo.movedim(-1, 0)[None]
-            metrics["gain_psnr"] = float(self.psnr(truth, predicted))
-            metrics["gain_ssim"] = float(self.ssim(truth, predicted))
-            metrics["gain_lpips"] = float(self.lpips(truth, predicted))
-        for name in ("lpips", "cc_lpips", "gain_lpips"):
+        for name in ("lpips", "cc_lpips"):
             if name in metrics and math.isnan(metrics[name]):
                 del metrics[name]
+        camera = self.camera_of_held_out(batch)
+        if camera is not None and self.exposure is not None:
+            colors, alpha = self.draw_unclamped(camera)
+            metrics |= self.gain_metrics(colors, alpha, batch)
         return metrics, images
 
     @torch.no_grad()
-    def at_exposure_of_photo(self, camera: Cameras, batch: Mapping[str, Any]) -> Tensor | None:
-        """Draw a held-out view, camera of shape [1], with its photo's gain; None if training used no gains. [H, W, 3]
+    def draw_unclamped(self, camera: Cameras) -> tuple[Tensor, Tensor]:
+        """Draw a camera, shape [1]: colours without background, which may be above 1 [H, W, 3], and opacity [H, W, 1].
 
-        The photo's gain comes from points' colours, not from the rendering. Colours are clamped after it: what a photo
-        shows that is darker than the median may be above 1 at the median exposure.
+        Of a splat at the median exposure, colours above 1 show in photos that are darker than the median.
+        """
+        render, alpha, _ = self.render(self.pinhole(camera), self.color_options())
+        return render[0, ..., :3], alpha[0]
+
+    def gain_metrics(
+        self,
+        colors: Tensor,  # Without background, not clamped [H, W, 3]
+        alpha: Tensor,  # Opacity [H, W, 1]
+        batch: Mapping[str, Any],
+    ) -> dict[str, float]:
+        """Compare a held-out photo with its view at the photo's exposure: `gain_psnr`, `gain_ssim` and `gain_lpips`.
+
+        Without LPIPS's weights the last one is left out, and all are if training used no gains.
+        """
+        gained = self.at_exposure_of_photo(colors, alpha, batch)
+        if gained is None:
+            return {}
+        photo = self.composite_with_background(self.get_gt_img(batch["image"]), self.background.expand_as(gained))
+        predicted = gained.movedim(-1, 0)[None]
+        truth = photo.movedim(-1, 0)[None]
+        metrics = {
+            "gain_psnr": float(self.psnr(truth, predicted)),
+            "gain_ssim": float(self.ssim(truth, predicted)),
+        }
+        lpips = float(self.lpips(truth, predicted))
+        if not math.isnan(lpips):
+            metrics["gain_lpips"] = lpips
+        return metrics
+
+    def at_exposure_of_photo(
+        self,
+        colors: Tensor,  # Without background, not clamped [H, W, 3]
+        alpha: Tensor,  # Opacity [H, W, 1]
+        batch: Mapping[str, Any],
+    ) -> Tensor | None:
+        """Return a held-out view with its photo's gain, or None if training used no gains. [H, W, 3] in [0, 1]
+
+        The photo's gain comes from points' colours, not from the rendering.
         """
         if self.exposure is None:
             return None
         gains = self.gain_of_held_out(batch)
         if gains is None:
             return None
-        render, alpha, _ = self.render(self.pinhole(camera), self.color_options())
-        gained = apply_gains(render[..., :3], gains.to(alpha), alpha)
+        gained = apply_gains(colors, gains.to(alpha), alpha)
         behind = (1 - alpha) * self.background
-        return (gained + behind).clamp(0.0, 1.0)[0]
+        return (gained + behind).clamp(0.0, 1.0)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state, the mean of the parameters so far, and the photos' gains."""

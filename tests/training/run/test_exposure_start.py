@@ -23,6 +23,7 @@ from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import parser_of, set_up
 from helpers.sharded_training import few_steps, set_up_together
 from helpers.short_runs import configure, nerfstudio_data, train
+from sadgs_ns.cli.measuring import measure_view
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
@@ -107,7 +108,7 @@ def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_
     model.gain_of_held_out = lambda data: factors
     camera, batch = pipeline.datamanager.next_eval(0)
     outputs = model.get_outputs_for_camera(camera)
-    gained = model.at_exposure_of_photo(camera, batch)
+    gained = model.at_exposure_of_photo(*model.draw_unclamped(camera), batch)
     assert gained is not None
     alpha = outputs["accumulation"]
     assert_allclose(gained, alpha * (1.5 * factors + 0.055 * (factors - 1)), atol=1e-5)
@@ -115,6 +116,10 @@ def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_
     metrics, _ = model.get_image_metrics_and_images(dict(outputs), batch)
     assert metrics["gain_psnr"] > 80
     assert metrics["psnr"] < 20
+    colors, _ = model.draw_unclamped(camera)
+    measured = [measure_view(pipeline, drawn, alpha, batch) for drawn in (colors, colors / 2)]
+    assert measured[0] == pytest.approx(metrics, rel=1e-5)
+    assert measured[1]["gain_psnr"] < 20, "a file is measured as it is"
 
 
 def test_gains_and_colours_of_points_are_those_that_were_drawn(exposed: Path, tmp_path: Path, capsys: Any):
