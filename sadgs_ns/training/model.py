@@ -38,6 +38,7 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.datamanager import NUM_PIXELS
 from sadgs_ns.training.exposure_table import ExposureTable
+from sadgs_ns.training.held_out_exposure import gain_metrics, view_at_exposure
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
 from sadgs_ns.training.lpips import load_lpips
 from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
@@ -541,49 +542,17 @@ class SadgsModel(SplatfactoModel):
         render, alpha, _ = self.render(self.pinhole(camera), self.color_options())
         return render[0, ..., :3], alpha[0]
 
-    def gain_metrics(
-        self,
-        colors: Tensor,  # Without background, not clamped [H, W, 3]
-        alpha: Tensor,  # Opacity [H, W, 1]
-        batch: Mapping[str, Any],
-    ) -> dict[str, float]:
-        """Compare a held-out photo with its view at the photo's exposure: `gain_psnr`, `gain_ssim` and `gain_lpips`.
+    def gain_metrics(self, colors: Tensor, alpha: Tensor, batch: Mapping[str, Any]) -> dict[str, float]:
+        """Compare a held-out photo with its view at its exposure, from what `draw_unclamped` returns; {} without gains.
 
-        Without LPIPS's weights the last one is left out, and all are if training used no gains.
+        The measures are `gain_psnr`, `gain_ssim` and, with its weights, `gain_lpips`.
         """
-        gained = self.at_exposure_of_photo(colors, alpha, batch)
-        if gained is None:
-            return {}
-        photo = self.composite_with_background(self.get_gt_img(batch["image"]), self.background.expand_as(gained))
-        predicted = gained.movedim(-1, 0)[None]
-        truth = photo.movedim(-1, 0)[None]
-        metrics = {
-            "gain_psnr": float(self.psnr(truth, predicted)),
-            "gain_ssim": float(self.ssim(truth, predicted)),
-        }
-        lpips = float(self.lpips(truth, predicted))
-        if not math.isnan(lpips):
-            metrics["gain_lpips"] = lpips
-        return metrics
-
-    def at_exposure_of_photo(
-        self,
-        colors: Tensor,  # Without background, not clamped [H, W, 3]
-        alpha: Tensor,  # Opacity [H, W, 1]
-        batch: Mapping[str, Any],
-    ) -> Tensor | None:
-        """Return a held-out view with its photo's gain, or None if training used no gains. [H, W, 3] in [0, 1]
-
-        The photo's gain comes from points' colours, not from the rendering.
-        """
-        if self.exposure is None:
-            return None
         gains = self.gain_of_held_out(batch)
         if gains is None:
-            return None
-        gained = apply_gains(colors, gains.to(alpha), alpha)
-        behind = (1 - alpha) * self.background
-        return (gained + behind).clamp(0.0, 1.0)
+            return {}
+        view = view_at_exposure(colors, alpha, gains, self.background)
+        photo = self.composite_with_background(self.get_gt_img(batch["image"]), self.background.expand_as(view))
+        return gain_metrics(view, photo, {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips})
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state, the mean of the parameters so far, and the photos' gains."""

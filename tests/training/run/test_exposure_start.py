@@ -26,6 +26,7 @@ from helpers.short_runs import configure, nerfstudio_data, train
 from sadgs_ns.cli.measuring import measure_view
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
+from sadgs_ns.training.held_out_exposure import view_at_exposure
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.run import exposure_start
 from sadgs_ns.training.run.point_observations import PointObservations
@@ -108,8 +109,7 @@ def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_
     model.gain_of_held_out = lambda data: factors
     camera, batch = pipeline.datamanager.next_eval(0)
     outputs = model.get_outputs_for_camera(camera)
-    gained = model.at_exposure_of_photo(*model.draw_unclamped(camera), batch)
-    assert gained is not None
+    gained = view_at_exposure(*model.draw_unclamped(camera), factors, model.background)
     alpha = outputs["accumulation"]
     assert_allclose(gained, alpha * (1.5 * factors + 0.055 * (factors - 1)), atol=1e-5)
     batch["image"] = gained
