@@ -85,7 +85,7 @@ def draw(
     pose = torch.eye(4, device=device)
     pose[:3] = torch.from_numpy(viewmat).to(pose)
     cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
-    colors, alphas = splat_file.draw_unclamped(splat, cameras)
+    colors, alphas = splat_file.draw(splat, cameras)
     if gains is not None:
         colors = apply_gains(colors, torch.tensor(gains, device=device), alphas)
     pinhole = colors.clamp(0, 1)[0].cpu().numpy()

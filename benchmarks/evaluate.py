@@ -20,7 +20,6 @@ import torch
 from torch import Tensor
 
 from sadgs_ns.gsplat_compat import NEAR_PLANE
-from sadgs_ns.training.held_out_exposure import view_at_exposure
 
 if TYPE_CHECKING:  # torchmetrics takes a second to import, which is no part of the training that is timed
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
@@ -65,11 +64,8 @@ def render(model: Any, view: View) -> tuple[dict[str, Tensor], Tensor]:
     if getattr(model.config, "color_corrected_metrics", False):
         images["cc_"] = color_correct(images[""], truth)
     if getattr(model, "exposure", None) is not None:  # Models of other methods have none.
-        gains = model.gain_of_held_out(batch)
-        if gains is not None:
-            colors, alpha = model.draw_unclamped(camera)
-            images["gain_"] = view_at_exposure(colors, alpha, gains, model.background)
-    return {prefix: _as_batch(image) for prefix, image in images.items()}, _as_batch(truth)
+        images["gain_"] = model.at_exposure_of_photo(outputs, batch)
+    return {prefix: _as_batch(image) for prefix, image in images.items() if image is not None}, _as_batch(truth)
 
 
 def _as_batch(image: Tensor) -> Tensor:

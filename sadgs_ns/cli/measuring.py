@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import statistics
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,14 @@ from sadgs_ns.training.run.deferred_imports import import_nerfstudio
 
 import_nerfstudio()  # It precedes what imports nerfstudio, and takes half the time.
 
+from nerfstudio.cameras.cameras import Cameras  # noqa: E402
+
 from sadgs_ns.cli.inspection import load_run  # noqa: E402
-from sadgs_ns.cli.splat_file import draw_unclamped, read_splat  # noqa: E402
+from sadgs_ns.cli.splat_file import Splat, draw, read_splat  # noqa: E402
 from sadgs_ns.errors import InputError  # noqa: E402
 from sadgs_ns.events import progress  # noqa: E402
+from sadgs_ns.training.model import SadgsModel  # noqa: E402
+from sadgs_ns.training.outputs import LazyOutputs  # noqa: E402
 from sadgs_ns.training.pipeline import SadgsPipeline  # noqa: E402
 
 STAGE = "views"
@@ -56,10 +60,8 @@ def measure(run: Path, data: Path, file: Path) -> list[str]:
     for index in range(len(views)):
         progress(STAGE, index, len(views))
         camera, batch = views[index]
-        colors, alpha = model.draw_unclamped(camera)
-        of_run.append(measure_view(pipeline, colors, alpha, batch))
-        drawn, opacity = draw_unclamped(splat, model.pinhole(camera), backend=model.config.backend)
-        of_file.append(measure_view(pipeline, drawn[0], opacity[0], batch))
+        of_run.append(_measure(model, model.get_outputs_for_camera(camera), batch))
+        of_file.append(_measure(model, outputs_of_file(model, splat, camera), batch))
     return describe(names, of_run, of_file, file.name)
 
 
@@ -72,19 +74,18 @@ def _names_of_views(pipeline: SadgsPipeline) -> list[str]:
     return [os.path.relpath(path, common) for path in held_out]
 
 
-def measure_view(
-    pipeline: SadgsPipeline,
-    colors: Tensor,  # Without background, not clamped [H, W, 3]
-    alpha: Tensor,  # Opacity [H, W, 1]
-    batch: dict[str, Any],
-) -> Measures:
+def outputs_of_file(model: SadgsModel, splat: Splat, camera: Cameras) -> LazyOutputs:
+    """Return what metrics need of a model's outputs, for a file drawn from a camera, shape [1], on its background."""
+    drawn, alphas = draw(splat, model.pinhole(camera), model.config.backend)
+    rgb = model.before_background(drawn, alphas, model.background).clamp(0, 1)[0]
+    outputs = {"rgb": rgb, "accumulation": alphas[0], "background": model.background.expand_as(rgb)}
+    return LazyOutputs(outputs, lambda: drawn[0])
+
+
+def _measure(model: SadgsModel, outputs: MutableMapping[str, Tensor], batch: dict[str, Any]) -> Measures:
     """Compare a drawn view with its photo."""
-    model = pipeline.model
-    rgb = (colors + (1 - alpha) * model.background).clamp(0, 1)
-    outputs = {"rgb": rgb, "accumulation": alpha, "background": model.background.expand_as(rgb)}
     measures, _ = model.get_image_metrics_and_images(outputs, batch)
-    # Those at the photo's exposure were of the run's own view.
-    return measures | model.gain_metrics(colors, alpha, batch)
+    return measures
 
 
 def describe(names: Sequence[str], of_run: Sequence[Measures], of_file: Sequence[Measures], file: str) -> list[str]:

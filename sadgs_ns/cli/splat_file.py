@@ -38,32 +38,17 @@ def read_splat(file: Path, device: torch.device) -> Splat:
     return Splat(gaussians, stored.degree)
 
 
-def draw(
-    splat: Splat, cameras: Cameras, background: torch.Tensor | None = None, backend: BackendName = "auto"
-) -> torch.Tensor:
+def draw(splat: Splat, cameras: Cameras, backend: BackendName = "auto") -> tuple[torch.Tensor, torch.Tensor]:
     """Draw a splat from `NEAR_PLANE` on and without a limit off the axis, since viewers know neither of a run's.
 
     Args:
         splat: The Gaussians.
         cameras: C of them in the file's frame, on the Gaussians' device.
-        background: Colour behind the Gaussians, black by default. [3]
         backend: The backend that draws.
 
     Returns:
-        Colours in [0, 1]. [C, height, width, 3]
-    """
-    colors, alphas = draw_unclamped(splat, cameras, backend)
-    if background is not None:
-        colors = colors + (1 - alphas) * background
-    return colors.clamp(0, 1)
-
-
-def draw_unclamped(splat: Splat, cameras: Cameras, backend: BackendName = "auto") -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw a splat as `draw`, without background.
-
-    Returns:
-        Colours that may be above 1, as photos that are darker than the splat's exposure show [C, height, width, 3], and
-        accumulated opacity [C, height, width, 1].
+        Colours without background, which may be above 1, as a photo that is darker than the splat's exposure shows
+        them [C, height, width, 3], and accumulated opacity [C, height, width, 1].
     """
     options = RenderOptions(sh_degree=splat.degree, backend=backend)
     colors, alphas, _ = rasterize(splat.gaussians, cameras, options)

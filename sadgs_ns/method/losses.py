@@ -58,7 +58,7 @@ def photometric_loss(
         return kernel.photometric_loss(
             predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, parts=parts
         )
-    target = _as_floats(target)
+    target = as_floats(target)
     difference = predicted - target
     l1 = difference.abs().mean()
     l2 = difference.square().mean()
@@ -70,7 +70,7 @@ def photometric_loss(
     return loss, psnr
 
 
-def _as_floats(
+def as_floats(
     target: Tensor,  # [C, H, W, 3]
 ) -> Tensor:
     """Return an image in bytes as floats in [0, 1], and others as they are. [C, H, W, 3]"""
@@ -130,7 +130,7 @@ def photometric_part(
     # L1 and L2 of these rows, and their share of all rows.
     share_of_rows = (last - first) / height
     own = slice(first - top, last - top)
-    difference = predicted[:, own] - _as_floats(target[:, own])
+    difference = predicted[:, own] - as_floats(target[:, own])
     l1 = difference.abs().mean()
     l2 = difference.square().mean()
     of_pixels = (1 - ssim_lambda) * l1 + L2_LAMBDA * l2

@@ -38,7 +38,6 @@ from sadgs_ns.render.types import Gaussians, RenderOptions
 from sadgs_ns.training.config import SadgsModelConfig
 from sadgs_ns.training.datamanager import NUM_PIXELS
 from sadgs_ns.training.exposure_table import ExposureTable
-from sadgs_ns.training.held_out_exposure import gain_metrics, view_at_exposure
 from sadgs_ns.training.initial_gaussians import color_features, initial_gaussians, spheres
 from sadgs_ns.training.lpips import load_lpips
 from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
@@ -95,7 +94,6 @@ class SadgsModel(SplatfactoModel):
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
         self.exposure: ExposureTable | None = None  # Stored with the extra state, as its size is that of the data
         self.gain_of_held_out: Callable[[Mapping[str, Any]], Tensor | None] = lambda data: None
-        self.camera_of_held_out: Callable[[Mapping[str, Any]], Cameras | None] = lambda data: None
         self.register_buffer("gain_matrices", None, persistent=False)  # Those of `exposure`. [V, 3, 4]
         # An index that is made in a step must be copied to the device in that step.
         self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
@@ -446,7 +444,14 @@ class SadgsModel(SplatfactoModel):
                 outputs |= self.viewer_outputs(camera, outputs)
             return outputs
         params = self.cropped(dict(self.gauss_params.items()))
-        return LazyOutputs({**outputs, NORMALS: lambda: self.get_normals(camera, params)})
+        named = {**outputs, NORMALS: lambda: self.get_normals(camera, params)}
+        return LazyOutputs(named, lambda: self.draw_unclamped(camera))
+
+    @torch.no_grad()
+    def draw_unclamped(self, camera: Cameras) -> Tensor:
+        """Render the colours of one camera, shape [1], without background; they may be above 1. [H, W, 3]"""
+        render, _, _ = self.render(self.pinhole(camera), self.color_options())
+        return render[0, ..., :3]
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
         """Return a rendering without its background, and how opaque it is, in [0, 1]. [H, W, 4]"""
@@ -517,42 +522,40 @@ class SadgsModel(SplatfactoModel):
         return metric(predicted, target)
 
     def get_image_metrics_and_images(
-        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+        self, outputs: MutableMapping[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return PSNR, SSIM and, if its weights can be loaded, LPIPS of one held-out view.
 
         If training used gains, `gain_psnr` and so on compare the photo with a rendering at its exposure.
         """
-        metrics, images = super().get_image_metrics_and_images(outputs, batch)
-        for name in ("lpips", "cc_lpips"):
+        metrics, images = super().get_image_metrics_and_images(outputs, batch)  # type: ignore[arg-type]
+        gained = self.at_exposure_of_photo(outputs, batch)
+        if gained is not None:
+            photo = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+            predicted = gained.movedim(-1, 0)[None]
+            truth = photo.movedim(-1, 0)[None]
+            metrics["gain_psnr"] = float(self.psnr(truth, predicted))
+            metrics["gain_ssim"] = float(self.ssim(truth, predicted))
+            metrics["gain_lpips"] = float(self.lpips(truth, predicted))
+        for name in ("lpips", "cc_lpips", "gain_lpips"):
             if name in metrics and math.isnan(metrics[name]):
                 del metrics[name]
-        camera = self.camera_of_held_out(batch)
-        if camera is not None and self.exposure is not None:
-            colors, alpha = self.draw_unclamped(camera)
-            metrics |= self.gain_metrics(colors, alpha, batch)
         return metrics, images
 
-    @torch.no_grad()
-    def draw_unclamped(self, camera: Cameras) -> tuple[Tensor, Tensor]:
-        """Draw a camera, shape [1]: colours without background, which may be above 1 [H, W, 3], and opacity [H, W, 1].
+    def at_exposure_of_photo(self, outputs: Mapping[str, Tensor], batch: Mapping[str, Any]) -> Tensor | None:
+        """Return a held-out view's rendering with its photo's gain, or None if training used no gains. [H, W, 3]
 
-        Of a splat at the median exposure, colours above 1 show in photos that are darker than the median.
+        The photo's gain comes from points' colours, not from the rendering, and is applied before clamping.
         """
-        render, alpha, _ = self.render(self.pinhole(camera), self.color_options())
-        return render[0, ..., :3], alpha[0]
-
-    def gain_metrics(self, colors: Tensor, alpha: Tensor, batch: Mapping[str, Any]) -> dict[str, float]:
-        """Compare a held-out photo with its view at its exposure, from what `draw_unclamped` returns; {} without gains.
-
-        The measures are `gain_psnr`, `gain_ssim` and, with its weights, `gain_lpips`.
-        """
+        if self.exposure is None:
+            return None
         gains = self.gain_of_held_out(batch)
         if gains is None:
-            return {}
-        view = view_at_exposure(colors, alpha, gains, self.background)
-        photo = self.composite_with_background(self.get_gt_img(batch["image"]), self.background.expand_as(view))
-        return gain_metrics(view, photo, {"psnr": self.psnr, "ssim": self.ssim, "lpips": self.lpips})
+            return None
+        assert isinstance(outputs, LazyOutputs)  # Only the viewer gets others.
+        alpha = outputs["accumulation"]
+        gained = apply_gains(outputs.unclamped(), gains.to(alpha), alpha)
+        return self.before_background(gained, alpha, outputs["background"]).clamp(0.0, 1.0)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the step, the strategy's state, the mean of the parameters so far, and the photos' gains."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import UserDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +20,14 @@ class LazyOutputs(UserDict[str, Any]):
 
     nerfstudio does not tell a model which outputs it needs. Without this, each output would cost `ns-eval` and
     `ns-render` time.
+
+    `unclamped` returns the colours of `rgb` without background, which may be above 1 [H, W, 3]. A photo that is darker
+    than the splat's exposure shows such colours. It is no output by name, because `ns-render` writes these as images.
     """
+
+    def __init__(self, values: Mapping[str, Any], unclamped: Callable[[], Tensor]) -> None:
+        super().__init__(values)
+        self.unclamped = unclamped
 
     def __getitem__(self, name: str) -> Tensor:
         value: Any = self.data[name]

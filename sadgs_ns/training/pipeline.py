@@ -109,7 +109,6 @@ class SadgsPipeline(VanillaPipeline):
         self.cleaning = CleaningPanel(shown_run)
         self.model.viewer_outputs = self._viewer_outputs
         self.model.gain_of_held_out = self._gain_of_held_out
-        self.model.camera_of_held_out = self._camera_of_held_out
 
     def _store_images(self) -> None:
         """Keep the images where the memory has room for them, and print it if that is not where the options say."""
@@ -170,11 +169,6 @@ class SadgsPipeline(VanillaPipeline):
         observations = observing.of_one(index, data)
         stops, _ = gains_of_others(observations, table.points.double().numpy(), 1)
         return srgb_gains(torch.from_numpy(stops[0]))
-
-    def _camera_of_held_out(self, data: Mapping[str, Any]) -> Cameras:
-        """Return the camera, shape [1], of a held-out photo that the datamanager gave as `data`."""
-        index = int(data["image_idx"])
-        return self.datamanager.eval_dataset.cameras[index : index + 1].to(self.device)
 
     def _stops_by_exif(self, file: Path) -> Tensor:
         """Return log₂ of a held-out photo's gain, relative to the training photos' median, by EXIF; 0 without. [3]"""

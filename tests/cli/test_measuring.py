@@ -64,7 +64,8 @@ def test_a_file_is_drawn_without_the_limits_of_a_run(bands: int, tmp_path: Path)
     colors, alphas, _ = rasterize(gaussians, cameras, options)
     background = torch.tensor([0.1, 0.2, 0.3])
     expected = (colors + (1 - alphas) * background).clamp(0, 1)
-    drawn = draw(read_splat(tmp_path / "splat.ply", torch.device("cpu")), cameras, background)
+    colors, alphas = draw(read_splat(tmp_path / "splat.ply", torch.device("cpu")), cameras)
+    drawn = (colors + (1 - alphas) * background).clamp(0, 1)
     assert_within(drawn, expected, 1e-5)
     assert (drawn - background).abs().max() > 0.1, "something is drawn"
 

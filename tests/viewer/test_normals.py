@@ -88,7 +88,7 @@ def test_what_is_read_later_is_computed_once_and_only_then():
         calls.append("normals")
         return torch.ones(2)
 
-    outputs = LazyOutputs({"rgb": torch.zeros(2), "normals": normals})
+    outputs = LazyOutputs({"rgb": torch.zeros(2), "normals": normals}, unclamped=lambda: torch.zeros(2))
     assert "normals" in outputs
     assert list(outputs) == list(outputs.keys()) == ["rgb", "normals"]
     outputs["rgba"] = outputs["rgb"]

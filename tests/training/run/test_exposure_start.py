@@ -23,10 +23,10 @@ from helpers.json_files import read_json, write_json
 from helpers.kill_and_resume import parser_of, set_up
 from helpers.sharded_training import few_steps, set_up_together
 from helpers.short_runs import configure, nerfstudio_data, train
-from sadgs_ns.cli.measuring import measure_view
+from sadgs_ns.cli.measuring import outputs_of_file
+from sadgs_ns.cli.splat_file import Splat
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.held_out_exposure import view_at_exposure
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.run import exposure_start
 from sadgs_ns.training.run.point_observations import PointObservations
@@ -109,15 +109,21 @@ def test_held_out_photos_show_what_the_median_exposure_clips(exposed: Path, tmp_
     model.gain_of_held_out = lambda data: factors
     camera, batch = pipeline.datamanager.next_eval(0)
     outputs = model.get_outputs_for_camera(camera)
-    gained = view_at_exposure(*model.draw_unclamped(camera), factors, model.background)
+    gained = model.at_exposure_of_photo(outputs, batch)
+    assert gained is not None
     alpha = outputs["accumulation"]
     assert_allclose(gained, alpha * (1.5 * factors + 0.055 * (factors - 1)), atol=1e-5)
     batch["image"] = gained
-    metrics, _ = model.get_image_metrics_and_images(dict(outputs), batch)
+    metrics, _ = model.get_image_metrics_and_images(outputs, batch)
     assert metrics["gain_psnr"] > 80
     assert metrics["psnr"] < 20
-    colors, _ = model.draw_unclamped(camera)
-    measured = [measure_view(pipeline, drawn, alpha, batch) for drawn in (colors, colors / 2)]
+    gaussians, _ = model.gaussians()
+    first, rest = gaussians.colors
+    measured = []
+    for colors in ((first, rest), (first / 4, rest)):
+        splat = Splat(gaussians._replace(colors=colors), model.config.sh_degree)
+        measures, _ = model.get_image_metrics_and_images(outputs_of_file(model, splat, camera), batch)
+        measured.append(measures)
     assert measured[0] == pytest.approx(metrics, rel=1e-5)
     assert measured[1]["gain_psnr"] < 20, "a file is measured as it is"
 
