@@ -347,7 +347,12 @@ def test_the_command_writes_a_row_for_each_kernel(
         assert row["status"] == "ok"
         assert row["ratio"] > 0
         assert row["iterations"] == 12
-    assert rows[1]["replayed"] == {"densification": 0, "after": 0}
+    replayed = rows[1]["replayed"]
+    assert replayed["densification"] == 0  # A single step is no graph yet.
+    if DEVICE == "cuda":
+        assert replayed["after"] > 0
+    else:
+        assert replayed["after"] == 0
     assert {*rows[1]["ms"]} == {"densification", "after"}
     assert {*rows[3]["ms"]} == {"densification"}
     printed = capsys.readouterr().out

@@ -74,10 +74,11 @@ def test_the_parts_of_a_step_can_be_called_alone():
 
 def test_the_forward_projection_can_be_called_alone(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("triton", reason="Triton is not installed")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")  # Where there is a GPU, Triton needs it.
     monkeypatch.setattr(steps.gsplat_compat, "project", gsplat_stub.project)
     drawn = []
     for triton in (False, True):
-        step = Step(200, 40, 30, 1, CPU)
+        step = Step(200, 40, 30, 1, device)
         with steps.kernels.triton_switched(triton):
             radii, means2d, _, _ = step.project()
         drawn.append(steps.gsplat_compat.drawn(radii, means2d))
