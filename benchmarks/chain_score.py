@@ -13,6 +13,7 @@ import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,25 +48,38 @@ def read_photo(file: Path, max_size: int) -> Array:
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """A splat that a pinhole camera has drawn, and where it has the pixels of a distorted, enlarged photo."""
+
+    colors: Tensor  # Not clamped [1, h, w, 3]
+    alphas: Tensor  # [1, h, w, 1]
+    at_x: Array  # In px from the centre of the first column [H', W']
+    at_y: Array  # In px from the centre of the first row [H', W']
+    size: tuple[int, int]  # Width and height of the photo in px
+
+    def photo(self, gains: Sequence[float] | None = None) -> Array:
+        """Return what the distorted camera sees, in [0, 1]. [H, W, 3]
+
+        `gains`, factors of the channels [3], give colours the photo's exposure before they are clamped.
+        """
+        colors = self.colors
+        if gains is not None:
+            colors = apply_gains(colors, torch.tensor(gains, device=colors.device), self.alphas)
+        pinhole = colors.clamp(0, 1)[0].cpu().numpy()
+        warped = cv2.remap(pinhole, self.at_x, self.at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.resize(warped, self.size, interpolation=cv2.INTER_AREA).clip(0, 1)
+
+
 @torch.no_grad()
-def draw(
-    splat: Splat,
-    camera: Any,
-    viewmat: NDArray[np.float64],
-    size: tuple[int, int],
-    gains: Sequence[float] | None = None,
-) -> Array:
-    """Draw a splat as a camera of COLMAP sees it, with its distortion.
+def draw(splat: Splat, camera: Any, viewmat: NDArray[np.float64], size: tuple[int, int]) -> Drawing:
+    """Draw a splat for a photo of COLMAP's camera, with its distortion.
 
     Args:
         splat: In the frame of the camera's poses.
         camera: A pycolmap.Camera of the original photo.
         viewmat: World to camera. [3, 4]
-        size: Width and height of the result in px.
-        gains: Factors of the channels [3] that give colours the photo's exposure, before they are clamped.
-
-    Returns:
-        Colours in [0, 1]. [H, W, 3]
+        size: Width and height of the photo in px.
     """
     width = ENLARGED * size[0]
     height = ENLARGED * size[1]
@@ -86,14 +100,10 @@ def draw(
     pose[:3] = torch.from_numpy(viewmat).to(pose)
     cameras = Cameras(pose[None], K[None].float(), right - left, bottom - top)
     colors, alphas = splat_file.draw(splat, cameras)
-    if gains is not None:
-        colors = apply_gains(colors, torch.tensor(gains, device=device), alphas)
-    pinhole = colors.clamp(0, 1)[0].cpu().numpy()
     # OpenCV numbers pixels by their centres.
     at_x = (drawn_x - left - 0.5).astype(np.float32)
     at_y = (drawn_y - top - 0.5).astype(np.float32)
-    warped = cv2.remap(pinhole, at_x, at_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return cv2.resize(warped, size, interpolation=cv2.INTER_AREA).clip(0, 1)
+    return Drawing(colors, alphas, at_x, at_y, size)
 
 
 def _bounds(values: NDArray[np.float64], side: int) -> tuple[int, int]:
@@ -154,12 +164,13 @@ def compare(
         size = (photo.shape[1], photo.shape[0])
         viewmat = image.cam_from_world().matrix()
         truth = torch.from_numpy(photo).to(device)
-        rendered = draw(splat, image.camera, viewmat, size)
-        views[name] = measured(torch.from_numpy(rendered).to(device), truth, network)
-        if gains is not None:
-            gained = rendered
-            if image.name in gains:
-                gained = draw(splat, image.camera, viewmat, size, gains[image.name])
+        drawing = draw(splat, image.camera, viewmat, size)
+        views[name] = measured(torch.from_numpy(drawing.photo()).to(device), truth, network)
+        if gains is None:
+            continue
+        gain_views[name] = views[name]
+        if image.name in gains:
+            gained = drawing.photo(gains[image.name])
             gain_views[name] = measured(torch.from_numpy(gained).to(device), truth, network)
     columns = list(zip(*views.values(), strict=True))
     score = {

@@ -64,8 +64,10 @@ def render(model: Any, view: View) -> tuple[dict[str, Tensor], Tensor]:
     if getattr(model.config, "color_corrected_metrics", False):
         images["cc_"] = color_correct(images[""], truth)
     if getattr(model, "exposure", None) is not None:  # Models of other methods have none.
-        images["gain_"] = model.at_exposure_of_photo(outputs, batch)
-    return {prefix: _as_batch(image) for prefix, image in images.items() if image is not None}, _as_batch(truth)
+        gained = model.at_exposure_of_photo(outputs, batch)
+        if gained is not None:
+            images["gain_"] = gained
+    return {prefix: _as_batch(image) for prefix, image in images.items()}, _as_batch(truth)
 
 
 def _as_batch(image: Tensor) -> Tensor:

@@ -101,7 +101,7 @@ def test_a_gaussian_is_drawn_where_the_photo_s_distorted_camera_sees_it():
         opacities=torch.ones(1),
         colors=(torch.full((1, 3), 1.7), torch.zeros((1, 0, 3))),
     )
-    drawn = chain_score.draw(chain_score.Splat(gaussians, 0), camera, np.eye(3, 4), (80, 60))
+    drawn = chain_score.draw(chain_score.Splat(gaussians, 0), camera, np.eye(3, 4), (80, 60)).photo()
     assert drawn.shape == (60, 80, 3)
     assert drawn.max() > 0.5
     y, x = np.mgrid[:60, :80] + 0.5
@@ -124,9 +124,9 @@ def test_an_exposure_shows_what_is_too_bright_at_the_median_one():
         colors=(torch.full((1, 3), 1.0 / 0.28209479), torch.zeros((1, 0, 3))),  # Harmonics that mean 1.5
     )
     splat = chain_score.Splat(gaussians, 0)
-    arguments = (splat, camera, np.eye(3, 4), (24, 16))
-    assert chain_score.draw(*arguments)[8, 12].tolist() == [1, 1, 1]
-    gained = chain_score.draw(*arguments, gains=[0.6, 0.5, 0.4])[8, 12]
+    drawing = chain_score.draw(splat, camera, np.eye(3, 4), (24, 16))
+    assert drawing.photo()[8, 12].tolist() == [1, 1, 1]
+    gained = drawing.photo(gains=[0.6, 0.5, 0.4])[8, 12]
     alpha = 0.999
     expected = [alpha * (1.5 * k + 0.055 * (k - 1)) for k in (0.6, 0.5, 0.4)]
     assert_allclose(gained, expected, atol=2e-3)
