@@ -23,23 +23,24 @@ class Picture(NamedTuple):
 
 
 def rasterize(
-    world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions
+    world: World, gaussians: Gaussians, cameras: Cameras, options: RenderOptions, color_maps: Tensor | None = None
 ) -> tuple[list[Picture], dict[str, Any]]:
     """Render the Gaussians of all processes into V cameras; each process composites its share of the rows.
 
-    Every process must call this with the same cameras and options, and then `backward`, in the same order. `gaussians`
-    are those of this process, and `world.sizes` must be right. Several processes wait for the exact lengths of tile
-    lists, and give `viewmats` no gradient. Raises InputError as `render.rasterization.rasterize`.
+    Every process must call this with the same cameras, options and colour maps (`project` tells of these), and then
+    `backward`, in the same order. `gaussians` are those of this process, and `world.sizes` must be right. Several
+    processes wait for the exact lengths of tile lists, and give `viewmats` no gradient. Raises InputError as
+    `render.rasterization.rasterize`.
 
     Returns the pictures that this process composited, and the `info` of its Gaussians in all views. A single process
     composites one picture of everything. With several processes, `info` has `anchor`, which `Exchange.send` returns,
     and `num_pairs` and `num_pixels` that this process composited.
     """
     if world.is_single:
-        colors, alphas, info = render.rasterize(gaussians, cameras, options)
+        colors, alphas, info = render.rasterize(gaussians, cameras, options, color_maps=color_maps)
         return [Picture(None, colors, alphas)], info
     options = replace(options, tile_capacity=None)
-    projected = render.project(gaussians, cameras, options, begin_tiles=False)
+    projected = render.project(gaussians, cameras, options, color_maps=color_maps, begin_tiles=False)
     bands = share_rows(len(cameras.viewmats), cameras.height, world.num_ranks)
     exchange = Exchange(world, projected, bands)
     anchor, received = exchange.send(projected, options.absgrad)

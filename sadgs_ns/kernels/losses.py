@@ -39,6 +39,12 @@ def _target(y, i, exists):
 
 
 @triton.jit
+def _is_excused(rendered, photo, clipped_from):
+    """Tell where the photo is clipped and the rendering is brighter, which is no error."""
+    return (photo >= clipped_from) & (rendered > photo)
+
+
+@triton.jit
 def _no_windows(GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr):
     """Return the windows of `_add_row` before the first row."""
     windows = ()
@@ -80,11 +86,15 @@ def _slopes(e_x, e_y, e_xx, e_yy, e_xy):
 
 # One view of several may begin at no multiple of 16 bytes: Triton would compile another kernel for that.
 @triton.jit(do_not_specialize=["n", "height", "row", "rows"], do_not_specialize_on_alignment=["y"])
-def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr):
+def _similarity(
+    x, y, slopes, sums, n, height, row, rows, clipped_from,
+    EXCUSES: tl.constexpr, GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr,
+):  # fmt: skip
     """Sum SSIM, |x − y| and (x − y)² of a strip, and write SSIM's derivatives by E[x], E[x²] and E[xy].
 
-    The derivatives lie where a window begins, and are 0 where no whole window does. `_MARGIN` zeros precede the first,
-    so that before each row of each map lie the zeros of another's end.
+    With EXCUSES, y takes the place of x where `_is_excused`. The derivatives lie where a window begins, and are 0 where
+    no whole window does. `_MARGIN` zeros precede the first, so that before each row of each map lie the zeros of
+    another's end.
     """
     reach = tl.constexpr(len(GAUSSIAN) - 1)
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
@@ -116,6 +126,8 @@ def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr
         for k in tl.static_range(len(GAUSSIAN)):
             a = tl.load(x_row + 3 * k)
             b = _target(y_row, 3 * k, True)
+            if EXCUSES:
+                a = tl.where(_is_excused(a, b, clipped_from), b, a)
             wa = GAUSSIAN[k] * a
             wb = GAUSSIAN[k] * b
             e_x += wa
@@ -130,7 +142,11 @@ def _similarity(x, y, slopes, sums, n, height, row, rows, GAUSSIAN: tl.constexpr
         e_xy, of_xy = _add_row(of_xy, e_xy, GAUSSIAN)
         i = top + r * row + c
         counted = inside & (r < last)
-        difference = tl.load(x + i, counted, 0.0) - _target(y, i, counted)
+        rendered = tl.load(x + i, counted, 0.0)
+        photo = _target(y, i, counted)
+        difference = rendered - photo
+        if EXCUSES:
+            difference = tl.where(_is_excused(rendered, photo, clipped_from), 0.0, difference)
         absolute += tl.abs(difference)
         square += difference * difference
         if r >= first + reach:  # The windows that end here have begun in this strip.
@@ -177,10 +193,13 @@ def _finish(
 
 @triton.jit(do_not_specialize=["n", "height", "row", "rows"], do_not_specialize_on_alignment=["y"])
 def _gradient(
-    x, y, slopes, upstream, gradient, n, height, row, rows, l1_weight, ssim_weight, l2_weight,
-    GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr,
+    x, y, slopes, upstream, gradient, n, height, row, rows, l1_weight, ssim_weight, l2_weight, clipped_from,
+    EXCUSES: tl.constexpr, GAUSSIAN: tl.constexpr, COLUMNS: tl.constexpr,
 ):  # fmt: skip
-    """Compute the gradient of the whole loss by x, with the adjoint of the blur of a strip's derivatives."""
+    """Compute the gradient of the whole loss by x, with the adjoint of the blur of a strip's derivatives.
+
+    With EXCUSES it is 0 where `_is_excused`.
+    """
     reach = tl.constexpr(len(GAUSSIAN) - 1)
     c = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
     first = tl.program_id(1) * rows
@@ -215,6 +234,8 @@ def _gradient(
             sign = tl.where(a > b, 1.0, 0.0) - tl.where(a < b, 1.0, 0.0)
             of_ssim = by_x + 2 * a * by_xx + b * by_xy
             total = l1_weight * sign + 2 * l2_weight * (a - b) - ssim_weight * of_ssim
+            if EXCUSES:
+                total = tl.where(_is_excused(a, b, clipped_from), 0.0, total)
             tl.store(gradient + i, factor * total, inside)
 
 
@@ -230,7 +251,7 @@ class _PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, x: Tensor, y: Tensor, window: tuple[float, ...], ssim_lambda: float, l2_lambda: float,
-        parts: Tensor | None,
+        parts: Tensor | None, clipped_from: float | None,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         views, height, width, _ = x.shape
         n = x.numel()
@@ -238,7 +259,9 @@ class _PhotometricLoss(torch.autograd.Function):
         grid, rows = _strips(views, height, row)
         slopes = x.new_empty(_MARGIN.value + 3 * n)
         sums = x.new_empty((3, math.prod(grid)))
-        _similarity[grid](x, y, slopes, sums, n, height, row, rows, window, _COLUMNS)
+        excuses = clipped_from is not None
+        ctx.clipped = (clipped_from if excuses else 0.0, excuses)
+        _similarity[grid](x, y, slopes, sums, n, height, row, rows, *ctx.clipped, window, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
         ctx.window = window
         ctx.num_parts = 0 if parts is None else len(parts)
@@ -262,14 +285,18 @@ class _PhotometricLoss(torch.autograd.Function):
         gradient = torch.empty_like(x)
         grid, rows = _strips(views, height, 3 * width)
         _gradient[grid](
-            x, y, slopes, upstream, gradient, x.numel(), height, 3 * width, rows, *ctx.weights, ctx.window, _COLUMNS
-        )
-        return gradient, *[None] * 4, upstream.expand(ctx.num_parts) if ctx.num_parts else None
+            x, y, slopes, upstream, gradient,
+            x.numel(), height, 3 * width, rows, *ctx.weights, *ctx.clipped, ctx.window, _COLUMNS,
+        )  # fmt: skip
+        of_parts = None
+        if ctx.num_parts:
+            of_parts = upstream.expand(ctx.num_parts)
+        return gradient, None, None, None, None, of_parts, None
 
 
 def photometric_loss(
     predicted: Tensor, target: Tensor, window: tuple[float, ...],
-    *, ssim_lambda: float, l2_lambda: float, parts: Tensor | None = None,
+    *, ssim_lambda: float, l2_lambda: float, parts: Tensor | None = None, clipped_from: float | None = None,
 ) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Do what `method.losses.photometric_loss` does, for views at least as large as SSIM's window.
 
@@ -277,5 +304,5 @@ def photometric_loss(
     """
     check_pixels(*predicted.shape[:3])
     return _PhotometricLoss.apply(  # type: ignore[return-value]
-        predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda, parts
+        predicted.contiguous(), target.contiguous(), window, ssim_lambda, l2_lambda, parts, clipped_from
     )

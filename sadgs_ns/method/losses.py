@@ -31,6 +31,7 @@ def photometric_loss(
     ssim_lambda: float = 0.2,
     l2_lambda: float = L2_LAMBDA,
     parts: Tensor | None = None,  # [P]
+    clipped_from: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """(1 − λ) L1 + λ (1 − SSIM) + λ_2 ℓ2, each a mean over views, pixels and channels.
 
@@ -42,6 +43,7 @@ def photometric_loss(
         ssim_lambda: λ in [0, 1].
         l2_lambda: λ_2 ≥ 0.
         parts: Numbers whose sum is added to the loss, such as a penalty from `render.activations.activate`. [P]
+        clipped_from: Value of the target from which something brighter is no error (`excuse_clipped`); None counts all.
 
     Returns:
         The loss, and PSNR in dB for values in [0, 1], without gradient; both are scalars.
@@ -56,9 +58,12 @@ def photometric_loss(
         from sadgs_ns.kernels import losses as kernel
 
         return kernel.photometric_loss(
-            predicted, target, WINDOW, ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, parts=parts
-        )
+            predicted, target, WINDOW,
+            ssim_lambda=ssim_lambda, l2_lambda=l2_lambda, parts=parts, clipped_from=clipped_from,
+        )  # fmt: skip
     target = as_floats(target)
+    if clipped_from is not None:
+        predicted = excuse_clipped(predicted, target, clipped_from)
     difference = predicted - target
     l1 = difference.abs().mean()
     l2 = difference.square().mean()
@@ -77,6 +82,20 @@ def as_floats(
     if target.dtype == torch.uint8:
         return target / 255.0
     return target
+
+
+def excuse_clipped(
+    predicted: Tensor,  # At the exposure of its target, not clamped [C, H, W, 3]
+    target: Tensor,  # Floats in [0, 1] [C, H, W, 3]
+    clipped_from: float,
+) -> Tensor:
+    """Return a rendering with the target's values wherever these are clipped and the rendering is brighter.
+
+    A clipped pixel tells only that the scene is no darker. Its loss, and the gradient of a brighter rendering, is 0.
+    Otherwise long exposures would darken the sky that short ones show as it is. [C, H, W, 3]
+    """
+    is_excused = (target >= clipped_from) & (predicted > target)
+    return torch.where(is_excused, target, predicted)
 
 
 def _similarity(
@@ -101,6 +120,7 @@ def photometric_part(
     top: int,
     height: int,
     ssim_lambda: float = 0.2,
+    clipped_from: float | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Compute the part of a view's `photometric_loss` that some rows contribute; the parts of all rows sum to it.
 
@@ -112,10 +132,14 @@ def photometric_part(
         rows: First row that counts and one past the last.
         top: The view's row that is the first of `predicted`.
         height: The view's in px, at least 11 unless all rows count.
+        clipped_from: As for `photometric_loss`.
 
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
     """
+    if clipped_from is not None:
+        target = as_floats(target)
+        predicted = excuse_clipped(predicted, target, clipped_from)
     first, last = rows
     if last - first == height:
         loss, psnr = photometric_loss(predicted, target, ssim_lambda=ssim_lambda)

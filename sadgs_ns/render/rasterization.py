@@ -16,14 +16,19 @@ from sadgs_ns.render.types import DEFAULTS, BackendName, Cameras, Gaussians, Pro
 
 
 def rasterize(
-    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS
+    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS, *, color_maps: Tensor | None = None
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Project and composite Gaussians, on their device; see `project` and `composite`."""
-    return composite(project(gaussians, cameras, options), options)
+    return composite(project(gaussians, cameras, options, color_maps=color_maps), options)
 
 
 def project(
-    gaussians: Gaussians, cameras: Cameras, options: RenderOptions = DEFAULTS, *, begin_tiles: bool = True
+    gaussians: Gaussians,
+    cameras: Cameras,
+    options: RenderOptions = DEFAULTS,
+    *,
+    color_maps: Tensor | None = None,
+    begin_tiles: bool = True,
 ) -> Projected:
     """Project Gaussians into cameras and compute their colours, differentiably.
 
@@ -31,6 +36,9 @@ def project(
         gaussians: In float32, or for the torch backend in float64, too.
         cameras: On the same device. With the Triton backend `Ks` gets no gradient.
         options: The same as for `composite`.
+        color_maps: Factors a and offsets b of each view, which change its Gaussians' colours c into a c + b, such as
+            the gains of a photo. With α that of a pixel, its colour C becomes a C + b α. They have no gradient.
+            None changes nothing. [C, 2, 3]
         begin_tiles: Whether `composite` will get this result unchanged. The Triton backend then begins its tile lists
             here, so that the host waits for their length while the device computes colours.
 
@@ -38,7 +46,13 @@ def project(
         InputError: If `options.backend` does not draw on this device, or there are more Gaussians or pixels than the
             Triton kernels can address (kernels/limits.py).
     """
-    return _backend(options.backend, gaussians.means.device).project(gaussians, cameras, options, begin_tiles)
+    backend = _backend(options.backend, gaussians.means.device)
+    projected = backend.project(gaussians, cameras, options, begin_tiles)
+    if color_maps is not None:
+        # There are fewer Gaussians than pixels, and their offsets leave the alphas without a gradient.
+        factors, offsets = color_maps.detach()[:, :, None].unbind(dim=1)  # [C, 1, 3] each
+        projected = projected._replace(colors=torch.addcmul(offsets, projected.colors, factors))
+    return projected
 
 
 def composite(projected: Projected, options: RenderOptions = DEFAULTS) -> tuple[Tensor, Tensor, dict[str, Any]]:

@@ -36,11 +36,14 @@ class ExposureTable:
         """Return the factors of sRGB's values by `srgb_gains`. [V, 3]"""
         return srgb_gains(self.stops)
 
-    def matrices(self) -> Tensor:
-        """Return the gains as matrices (M | b) for `correct_colors`. float32 [V, 3, 4]"""
+    def color_maps(self) -> Tensor:
+        """Return the gains as `render.rasterization.project` takes them, with the offsets of `apply_gains`.
+
+        float32 [V, 2, 3]
+        """
         gains = self.gains()
         offsets = OFFSET * (gains - 1)
-        return torch.cat([gains.diag_embed(), offsets[:, :, None]], dim=2).float()
+        return torch.stack([gains, offsets], dim=1).float()
 
 
 def photo_names(files: Sequence[Path]) -> list[str]:

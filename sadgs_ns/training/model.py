@@ -42,7 +42,6 @@ from sadgs_ns.training.initial_gaussians import color_features, initial_gaussian
 from sadgs_ns.training.lpips import load_lpips
 from sadgs_ns.training.outputs import LazyOutputs, crop_background, in_viewer, rgba_image, warn_once
 from sadgs_ns.training.run.run_plan import RunPlan
-from sadgs_ns.training.step.color_matrices import anchored
 from sadgs_ns.training.step.dropout import Dropout
 from sadgs_ns.training.step.parameter_average import RunningMean
 from sadgs_ns.training.step.poses import RefinedPoses, fit_poses
@@ -62,7 +61,7 @@ class SadgsModel(SplatfactoModel):
     strategy: RunningStrategy
     plan: RunPlan  # There is none until `follow`, which comes before the first rendering.
     every_view_id: Tensor
-    gain_matrices: Tensor | None
+    exposure_maps: Tensor | None
 
     def populate_modules(self) -> None:
         """Make parameters, metrics and the strategy; splatfacto's own needs CUDA, and LPIPS's weights at once."""
@@ -94,7 +93,7 @@ class SadgsModel(SplatfactoModel):
             self.color_matrices = torch.nn.Parameter(torch.eye(3, 4).repeat(self.num_train_data, 1, 1))
         self.exposure: ExposureTable | None = None  # Stored with the extra state, as its size is that of the data
         self.gain_of_held_out: Callable[[Mapping[str, Any]], Tensor | None] = lambda data: None
-        self.register_buffer("gain_matrices", None, persistent=False)  # Those of `exposure`. [V, 3, 4]
+        self.register_buffer("exposure_maps", None, persistent=False)  # `color_maps` of `exposure`. [V, 2, 3]
         # An index that is made in a step must be copied to the device in that step.
         self.register_buffer("every_view_id", torch.arange(self.num_train_data), persistent=False)  # [V]
 
@@ -237,9 +236,9 @@ class SadgsModel(SplatfactoModel):
     def set_exposure(self, table: ExposureTable | None) -> None:
         """From now on, compare training photos with renderings at their exposure, or with plain ones if it is None."""
         self.exposure = table
-        self.gain_matrices = None
+        self.exposure_maps = None
         if table is not None:
-            self.gain_matrices = table.matrices().to(self.device)
+            self.exposure_maps = table.color_maps().to(self.device)
 
     def color_points(self, stops: Tensor) -> None:
         """Bring the Gaussians of SfM points to the median exposure; call before training.
@@ -263,27 +262,20 @@ class SadgsModel(SplatfactoModel):
         features = color_features(at_median, self.config.sh_degree).to(self.gauss_params["features_dc"])
         self.gauss_params["features_dc"].data[real[found.to(self.device)]] = features
 
-    @property
-    def has_view_colors(self) -> bool:
-        """Whether renderings of training views are changed by a colour matrix of each view."""
-        return self.color_matrices is not None or self.gain_matrices is not None
-
     def view_ids(self, cam_indices: Sequence[int]) -> Tensor | None:
         """Return indices of C views on the device, int64 [C], without waiting; None if a step needs none."""
-        if not self.has_view_colors and self.poses is None:
+        if self.color_matrices is None and self.exposure_maps is None and self.poses is None:
             return None
         return torch.cat([self.every_view_id[index : index + 1] for index in cam_indices])
 
-    def view_matrices(
+    def color_maps(
         self,
-        params: Mapping[str, Tensor],  # Of `trained_params`
-        view_ids: Tensor,  # int64 [C]
-    ) -> Tensor:
-        """Return the colour matrices of C training views, learned or of their exposure. [C, 3, 4]"""
-        if self.color_matrices is not None:
-            return anchored(params["color_matrices"], view_ids)
-        assert self.gain_matrices is not None  # Otherwise `view_ids` returns none.
-        return self.gain_matrices.index_select(0, view_ids)
+        view_ids: Tensor | None,  # What `view_ids` returned. int64 [C]
+    ) -> Tensor | None:
+        """Return how `render.rasterization.project` gives C training views their exposure; None without gains."""
+        if self.exposure_maps is None or view_ids is None:
+            return None
+        return self.exposure_maps.index_select(0, view_ids)
 
     def shown_rows(self, chosen: Tensor | None = None) -> Tensor | None:
         """Return which Gaussians are drawn: the chosen ones that lie in the viewer's crop box. bool [N]

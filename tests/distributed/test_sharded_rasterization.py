@@ -12,7 +12,7 @@ from torch.testing import assert_close
 
 from helpers.closeness import assert_within, assert_within_share
 from helpers.gloo_ranks import run_ranks
-from helpers.sharded_rendering import GAUSSIANS, HEIGHT, inputs, splats, weights
+from helpers.sharded_rendering import GAUSSIANS, HEIGHT, color_maps, inputs, splats, weights
 from sadgs_ns.distributed.bands import ROWS, share_rows, views_of_rank
 from sadgs_ns.distributed.rasterization import rasterize
 from sadgs_ns.distributed.world import World
@@ -34,7 +34,7 @@ def draw_together(world: World, views: int, uneven: bool, fused: bool) -> dict[s
     leaves = inputs(part)
     options = RenderOptions(sh_degree=1, absgrad=True, max_off_axis=1.5)
     world.flags_out = 1 << world.rank
-    rendered, info = rasterize(world, *splats(leaves, views), options)
+    rendered, info = rasterize(world, *splats(leaves, views), options, color_maps(views))
     loss = info["anchor"]
     images = []
     for band, colors, alphas in rendered:
@@ -69,7 +69,7 @@ def test_processes_draw_and_differentiate_what_one_does(
         pytest.importorskip("helpers.interpreted_rasterizer", reason="Triton is not installed", exc_type=ImportError)
     leaves = inputs()
     options = RenderOptions(sh_degree=1, absgrad=True, max_off_axis=1.5)
-    colors, alphas, info = rasterize_alone(*splats(leaves, views), options)
+    colors, alphas, info = rasterize_alone(*splats(leaves, views), options, color_maps=color_maps(views))
     info["means2d"].retain_grad()
     expected = torch.cat([colors, alphas], dim=-1)
     loss = (expected * weights(views)).sum()

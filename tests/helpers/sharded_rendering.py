@@ -47,6 +47,12 @@ def splats(leaves: dict[str, Tensor], views: int) -> tuple[Gaussians, Cameras]:
     return Gaussians(**halves), Cameras(viewmats, Ks, WIDTH, HEIGHT)
 
 
+def color_maps(views: int) -> Tensor:
+    """Factors and offsets of each view's colours, as gains of exposure have. [C, 2, 3]"""
+    factors = 0.5 + torch.rand((views, 3), generator=seeded(4))
+    return torch.stack([factors, 0.055 * (factors - 1)], dim=1)
+
+
 def weights(views: int) -> Tensor:
     """What the pixels' sum in the loss is weighted with, so that each gradient is its own."""
     return torch.rand((views, HEIGHT, WIDTH, 4), generator=seeded(2))

@@ -43,6 +43,32 @@ def test_loss_and_gradient_equal_the_float64_reference(shape):
     torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
 
 
+@pytest.mark.parametrize("in_bytes", [True, False])
+def test_what_clipped_pixels_excuse_equals_the_float64_reference(in_bytes: bool):
+    generator = torch.Generator().manual_seed(1)
+    shape = (2, 29, 47, 3)
+    bytes_of_target = torch.randint(200, 256, shape, generator=generator, dtype=torch.uint8)
+    noise = 0.1 * torch.randn(shape, generator=generator)
+    values = bytes_of_target / 255
+    is_excused = (values > 0.95) & (noise > 0)
+    assert 0.05 < is_excused.float().mean() < 0.3
+    results = []
+    for function, dtype in ((fused_photometric_loss, torch.float32), (losses.photometric_loss, torch.float64)):
+        y = values.to(DEVICE, dtype)
+        if in_bytes and function is fused_photometric_loss:
+            y = bytes_of_target.to(DEVICE)
+        x = (values + noise).to(DEVICE, dtype).requires_grad_()
+        loss, psnr = function(x, y, ssim_lambda=0.3, l2_lambda=1.5, clipped_from=0.95)
+        loss.backward()
+        assert x.grad is not None
+        assert torch.equal(x.grad == 0, is_excused.to(DEVICE))
+        results.append((loss.detach().double(), psnr.double(), x.grad.double()))
+    fast, reference = results
+    torch.testing.assert_close(fast[0], reference[0], atol=2e-6, rtol=0)
+    torch.testing.assert_close(fast[1], reference[1], atol=1e-5, rtol=0)
+    torch.testing.assert_close(fast[2], reference[2], atol=5e-5 * float(reference[2].abs().max()), rtol=0)
+
+
 def test_the_loss_does_not_depend_on_how_many_rows_a_program_handles(monkeypatch):
     generator = torch.Generator().manual_seed(0)
     target = torch.rand((1, 35, 12, 3), generator=generator).to(DEVICE)

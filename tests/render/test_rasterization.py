@@ -14,8 +14,10 @@ from helpers.closeness import assert_within
 from helpers.generators import seeded
 from helpers.refusals import refusal
 from helpers.rendered_scene import random_scene, render_with_gradients
+from helpers.sharded_rendering import color_maps, inputs, splats, weights
 from sadgs_ns.render import rasterization
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world, visible
+from sadgs_ns.render.types import RenderOptions
 
 
 def devices_have(monkeypatch: pytest.MonkeyPatch, triton: bool) -> None:
@@ -105,6 +107,34 @@ def test_viewmats_project_nerfstudios_rays_to_their_pixels(dtype: torch.dtype) -
         expected = camera.get_image_coords().flip(-1).reshape(-1, 2).to(dtype)  # pixel centres as (x, y)
         actual = pixels[:, :2] / pixels[:, 2:]
         assert_within(actual, expected, 1e-3)
+
+
+BACKENDS = ["torch"]
+if torch.cuda.is_available():
+    BACKENDS += ["gsplat", "triton"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_colour_maps_of_views_do_what_gains_of_their_pictures_do(backend: Any) -> None:
+    device = torch.device("cpu" if backend == "torch" else "cuda")
+    views = 3
+    maps = color_maps(views).to(device)
+    results = []
+    for of_gaussians in (True, False):
+        leaves = {name: value.detach().to(device).requires_grad_() for name, value in inputs().items()}
+        options = RenderOptions(sh_degree=1, backend=backend)
+        if of_gaussians:
+            colors, _, _ = rasterization.rasterize(*splats(leaves, views), options, color_maps=maps)
+        else:
+            rendered, alphas, _ = rasterization.rasterize(*splats(leaves, views), options)
+            factors, offsets = maps[:, :, None, None].unbind(dim=1)
+            colors = rendered * factors + alphas * offsets
+        (colors * weights(views).to(device)[..., :3]).sum().backward()
+        results.append({"colors": colors.detach()} | {name: leaf.grad for name, leaf in leaves.items()})
+    for_gaussians, for_pictures = results
+    for name, expected in for_pictures.items():
+        assert expected is not None
+        assert_within(for_gaussians[name], expected, 2e-5 * float(expected.abs().max()))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a CUDA device")

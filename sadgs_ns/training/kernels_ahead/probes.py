@@ -37,6 +37,7 @@ class KernelChoice:
     sh_degree: int = 3
     is_black: bool = True  # Whether nothing is drawn behind the Gaussians
     has_color_matrices: bool = False
+    has_gains: bool = False  # Whether photos are compared with renderings at their exposure
     moves_cameras: bool = False  # Whether the cameras' poses have gradients
     single_process: bool = True  # Whether one process holds all Gaussians
     size: tuple[int, int] = (_SIZE, _SIZE)  # Largest width and height of the images, in px
@@ -112,7 +113,11 @@ class Stages:
 
     def loss(self, dtype: torch.dtype) -> None:  # Images are bytes; a mask or transparency makes them floats.
         predicted = self.image.repeat(self.views, 1, 1, 1).requires_grad_()
-        photometric_loss(predicted, torch.zeros_like(predicted, dtype=dtype))[0].backward()
+        clipped_from = None
+        if self.choice.has_gains:
+            clipped_from = 1.0
+        target = torch.zeros_like(predicted, dtype=dtype)
+        photometric_loss(predicted, target, clipped_from=clipped_from)[0].backward()
 
     def poses(self) -> None:
         table = torch.zeros((self.views, 6), device=self.device, requires_grad=True)

@@ -25,7 +25,7 @@ from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
 from sadgs_ns.training.run.progress import warn
-from sadgs_ns.training.step.color_matrices import correct_colors
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 from sadgs_ns.training.step.images import thread_count
 from sadgs_ns.training.step.structure_cache import StructureCache
 
@@ -168,7 +168,9 @@ class MovedSearch:
         viewmats, Ks = self._views.stacked_cameras(indices)
         scale = Ks.new_tensor([width / full_width, height / full_height, 1.0])
         cameras = Cameras(viewmats, Ks * scale[:, None], width, height)
-        pictures, _ = rasterize(world, gaussians, cameras, model.color_options(expected_depth=True))
+        view_ids = model.view_ids(indices)
+        options = model.color_options(expected_depth=True)
+        pictures, _ = rasterize(world, gaussians, cameras, options, model.color_maps(view_ids))
         canvas = viewmats.new_zeros((len(indices), height, width, 5))  # Colour, depth and alpha
         for band, rendered, opacity in pictures:
             joined = torch.cat([rendered, opacity], dim=-1)
@@ -180,9 +182,8 @@ class MovedSearch:
         world.sum(canvas)
         colors = canvas[..., :3].contiguous()
         alphas = canvas[..., 4:].contiguous()
-        view_ids = model.view_ids(indices)
-        if model.has_view_colors and view_ids is not None:
-            colors = correct_colors(colors, alphas, model.view_matrices(model.trained_params, view_ids))
+        if model.color_matrices is not None and view_ids is not None:
+            colors = correct_colors(colors, alphas, anchored(model.color_matrices, view_ids))
         colors = model.before_background(colors, alphas, model.background).clamp(0, 1)
         depths = torch.where(alphas[..., 0] > _COVERED, canvas[..., 3], 0.0)
         return colors.movedim(-1, 1), depths, cameras

@@ -9,9 +9,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sadgs_ns.geometry.point_colors import BRIGHTEST
-from sadgs_ns.method.losses import as_floats
-
 
 def anchored(
     matrices: Tensor,  # [V, 3, 4]
@@ -38,17 +35,3 @@ def correct_colors(
     nothing.
     """
     return render @ matrices[:, None, :, :3].mT + alpha * matrices[:, None, None, :, 3]
-
-
-def excuse_clipped(
-    render: Tensor,  # at the exposure of its photo, not clamped [C, H, W, 3]
-    photo: Tensor,  # uint8, or floats in [0, 1] [C, H, W, 3]
-) -> Tensor:
-    """Return a rendering with the photo's values wherever the photo is clipped and the rendering is brighter.
-
-    A clipped pixel tells only that the scene is no darker. Its loss, and the gradient of a brighter rendering, is 0.
-    Otherwise long exposures would darken the sky that short ones show as it is. [C, H, W, 3]
-    """
-    values = as_floats(photo)
-    is_excused = (values > BRIGHTEST) & (render > values)
-    return torch.where(is_excused, values, render)

@@ -16,13 +16,17 @@ from torch import Tensor
 
 from sadgs_ns.distributed.bands import Band
 from sadgs_ns.distributed.rasterization import rasterize
+from sadgs_ns.geometry.point_colors import BRIGHTEST
 from sadgs_ns.method.losses import photometric_loss, photometric_part
 from sadgs_ns.render.types import Cameras, Gaussians, RenderOptions
 from sadgs_ns.training.model import SadgsModel
-from sadgs_ns.training.step.color_matrices import correct_colors, excuse_clipped
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 from sadgs_ns.training.step.images import stack, stack_masks
 from sadgs_ns.training.step.optimizers import AdamUpdate
 from sadgs_ns.training.step.row_adam import RowUpdate
+
+CLIPPED_FROM = BRIGHTEST + 0.5 / 255
+"""Value of photos from which they are clipped, with gains. It lies between two bytes, so that no rounding decides."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,7 @@ class ViewGroup:
     data: Sequence[Mapping[str, Tensor]]
     """`image` of each view, uint8 or floats in [0, 1] [H, W, 3 or 4], and perhaps `mask`, bool [H, W, 1]. With several
     processes, views that only others composite have none."""
-    view_ids: Tensor | None = None  # `indices` on the device if views have matrices or refined poses. int64 [V]
+    view_ids: Tensor | None = None  # `indices` on the device if views have colours or poses of their own. int64 [V]
     structure_tensors: Tensor | None = None  # Quantized S̄ if η is observed. uint8 [V, H, W, 3]
     images: Tensor | None = None  # The images, if they are in one tensor already. [V, H, W, 3]
     masks: Tensor | None = None  # The masks, if `images` is there and a view has one. bool [V, H, W, 1]
@@ -137,22 +141,21 @@ def _render_and_compare(
         if model.poses is not None and group.view_ids is not None:
             moved = model.poses.viewmats(cameras.viewmats, group.view_ids, leaves["poses"])
             cameras = cameras._replace(viewmats=moved)
-        pictures, info = rasterize(world, gaussians, cameras, group.options)
+        color_maps = model.color_maps(group.view_ids)
+        pictures, info = rasterize(world, gaussians, cameras, group.options, color_maps)
         viewmats, Ks = cameras[:2]
         info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
         model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
         infos.append(info)
         for band, colors, alphas in pictures:
-            if model.has_view_colors and group.view_ids is not None:
+            if model.color_matrices is not None and group.view_ids is not None:
                 view_ids = group.view_ids
                 if band is not None:
                     view_ids = view_ids[band.view : band.view + 1]
-                colors = correct_colors(colors, alphas, model.view_matrices(leaves, view_ids))
+                colors = correct_colors(colors, alphas, anchored(leaves["color_matrices"], view_ids))
             rgb = model.before_background(colors, alphas, model.background)
             rgb, photo = model.masked_pair(rgb, group.batch(band), model.background)
-            if model.exposure is not None:
-                rgb = excuse_clipped(rgb, photo)
-            loss, quality, views = _compare((rgb, photo), group, band, model.config.ssim_lambda, penalty)
+            loss, quality, views = _compare(model, (rgb, photo), group, band, penalty)
             if views != num_views:
                 loss = views / num_views * loss
                 quality = views / num_views * quality
@@ -165,10 +168,10 @@ def _render_and_compare(
 
 
 def _compare(
+    model: SadgsModel,
     pair: tuple[Tensor, Tensor],  # A rendering and its photo [V, H, W, 3], of a band its rows alone
     group: ViewGroup,
     band: Band | None,
-    ssim_lambda: float,
     penalty: Tensor | None,  # Numbers whose sum is added to the loss of a whole group
 ) -> tuple[Tensor, Tensor, int]:
     """Return the loss of a group or of one view's band, its quality, and the number of views that both are of.
@@ -176,8 +179,14 @@ def _compare(
     The quality is PSNR in dB of a group, and the mean square error of a band.
     """
     predicted, target = pair
+    ssim_lambda = model.config.ssim_lambda
+    clipped_from = None
+    if model.exposure is not None:
+        clipped_from = CLIPPED_FROM
     if band is None:
-        loss, quality = photometric_loss(predicted, target, ssim_lambda=ssim_lambda, parts=penalty)
+        loss, quality = photometric_loss(
+            predicted, target, ssim_lambda=ssim_lambda, parts=penalty, clipped_from=clipped_from
+        )
         return loss, quality, len(group.indices)
     loss, quality = photometric_part(
         predicted,
@@ -186,6 +195,7 @@ def _compare(
         top=band.top,
         height=group.cameras.height,
         ssim_lambda=ssim_lambda,
+        clipped_from=clipped_from,
     )
     return loss, quality, 1
 

@@ -71,6 +71,9 @@ print(len(found), missing)
 missing.clear()
 launch(replace(choice, has_color_matrices=True))
 print(sorted(missing))
+missing.clear()
+launch(replace(choice, has_gains=True))
+print(sorted(missing))
 """
 
 
@@ -84,9 +87,10 @@ def test_a_run_launches_nothing_that_was_not_compiled_ahead(tmp_path: Path):
     assert (tmp_path / "marker").exists()
     run = run_with_the_compiler(tmp_path, RUN)
     assert run.returncode == 0, run.stderr[-3000:]
-    default, colors = run.stdout.splitlines()
+    default, colors, gains = run.stdout.splitlines()
     assert default == f"{len(told)} []"
     assert colors == str(["_composite_backward"] * 2), "they are an option"
+    assert gains == str(["_gradient", "_gradient", "_similarity", "_similarity"]), "and so are gains"
 
 
 @pytest.mark.parametrize("lacking", ["nothing", "card", "cores", "kernels"])

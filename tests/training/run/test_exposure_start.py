@@ -134,13 +134,12 @@ def test_gains_and_colours_of_points_are_those_that_were_drawn(exposed: Path, tm
     assert "Exposure, by the points' colours, varies by 0.7" in printed
     table = model.exposure
     assert table is not None
-    assert model.gain_matrices is not None
+    assert model.exposure_maps is not None
     assert_allclose(table.stops, np.repeat(training_stops()[:, None], 3, axis=1), atol=0.1)
     expected = torch.exp2(table.stops / 2.4).float()
-    actual = model.gain_matrices.diagonal(dim1=1, dim2=2)
-    assert_close(actual, expected)
-    actual = model.gain_matrices[:, :, 3]
-    assert_close(actual, 0.055 * (expected - 1))
+    factors, offsets = model.exposure_maps.unbind(dim=1)
+    assert_close(factors, expected)
+    assert_close(offsets, 0.055 * (expected - 1))
 
 
 def test_colours_of_points_are_brought_from_their_photos_mean_to_the_median_exposure(exposed: Path, tmp_path: Path):
@@ -186,7 +185,7 @@ def test_a_resumed_run_has_the_same_gains_bit_for_bit(exposed: Path, tmp_path: P
     assert model.exposure is not None
     assert model.exposure.names == first.names
     assert torch.equal(model.exposure.stops, first.stops)
-    assert torch.equal(model.gain_matrices, first.matrices())  # type: ignore[arg-type]
+    assert torch.equal(model.exposure_maps, first.color_maps())  # type: ignore[arg-type]
     config.pipeline.model.exposure = "off"
     assert set_up(config).pipeline.model.exposure is None
 
@@ -231,8 +230,8 @@ def exposures_of(trainer: SadgsTrainer) -> dict[str, Any]:
     trainer.train()
     model = trainer.pipeline.model
     assert model.exposure is not None
-    assert model.gain_matrices is not None
-    return {"stops": model.exposure.stops, "matrices": model.gain_matrices, "losses": losses}
+    assert model.exposure_maps is not None
+    return {"stops": model.exposure.stops, "maps": model.exposure_maps, "losses": losses}
 
 
 def test_two_processes_train_with_the_same_gains_as_one(exposed: Path, tmp_path: Path):
@@ -247,7 +246,7 @@ def test_two_processes_train_with_the_same_gains_as_one(exposed: Path, tmp_path:
     results = run_ranks(exposures_together, 2, tmp_path / "meet", configured("together"))
     for result in results:
         assert torch.equal(result["stops"], alone["stops"])
-        assert torch.equal(result["matrices"], alone["matrices"])
+        assert torch.equal(result["maps"], alone["maps"])
         actual = torch.tensor(result["losses"][:4])
         expected = torch.tensor(alone["losses"][:4])
         assert_within_share(actual, expected, 1e-5)

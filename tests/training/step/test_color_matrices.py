@@ -9,8 +9,7 @@ from torch.testing import assert_close
 
 from helpers.closeness import assert_within
 from helpers.generators import seeded
-from sadgs_ns.geometry.point_colors import BRIGHTEST, OFFSET, srgb_gains
-from sadgs_ns.training.step.color_matrices import anchored, correct_colors, excuse_clipped
+from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
@@ -120,46 +119,3 @@ def test_matrices_that_follow_known_gains_leave_the_scene_at_the_mean_exposure()
     learned = correct_colors(truth.expand(5, -1, -1, -1), alpha, anchored(matrices, torch.arange(5)).detach())
     expected = gains[:, None, None, None] * truth
     assert_within(learned, expected, 0.03)
-
-
-@pytest.mark.parametrize("in_bytes", [True, False])
-def test_only_renderings_brighter_than_a_clipped_photo_are_excused(in_bytes: bool):
-    photo = torch.tensor([255, 255, 250, 250, 240, 240, 0], device=DEVICE, dtype=torch.uint8).view(1, 1, 7, 1)
-    photo = photo.expand(1, 1, 7, 3)
-    values = photo / 255
-    if not in_bytes:
-        photo = values
-    changes = torch.tensor([0.5, -0.5, 0.01, -0.01, 0.5, -0.5, 0.5], device=DEVICE).view(7, 1)
-    render = (values + changes).requires_grad_()
-    excused = excuse_clipped(render, photo)
-    error = (excused - values).abs()
-    error.sum().backward()
-    counts = torch.tensor([False, True, False, True, True, True, True], device=DEVICE)
-    assert ((error[0, 0] > 0) == counts[:, None]).all()
-    assert render.grad is not None
-    assert torch.equal(render.grad[0, 0] != 0, counts[:, None].expand(7, 3))
-
-
-@pytest.mark.hard_case(
-    "sky that long exposures clip, with gains of exposure",
-    "short exposures alone tell its colour; before, the long ones darkened it",
-)
-def test_photos_of_all_exposures_agree_on_a_sky_that_some_of_them_clip():
-    sky = 0.8
-    gains = srgb_gains(torch.tensor([-1.0, 0.0, 1.0]))
-    offsets = OFFSET * (gains - 1)
-    matrices = torch.cat([gains[:, None, None] * torch.eye(3), offsets[:, None, None].expand(3, 3, 1)], dim=2)
-    photos = (gains * sky + offsets).clamp(max=1).view(3, 1, 1, 1).expand(3, 4, 5, 3)
-    assert photos[2].amin() > BRIGHTEST
-    assert photos[1].amax() < BRIGHTEST
-    slopes = []
-    for error in (-0.02, 0.0, 0.02):
-        color = torch.full((3, 4, 5, 3), sky + error).requires_grad_()
-        rendered = excuse_clipped(correct_colors(color, torch.ones(3, 4, 5, 1), matrices), photos)
-        (rendered - photos).square().sum().backward()
-        assert color.grad is not None
-        slopes.append(float(color.grad.sum()))
-    darker, right, brighter = slopes
-    assert darker < 0
-    assert abs(right) < 1e-4
-    assert brighter > 0
