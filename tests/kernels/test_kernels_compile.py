@@ -30,7 +30,8 @@ INTEGERS = "n row height width taps num_gaussians num_views tile_width tile_heig
 INTEGERS += "channels weight_stride num_pairs rows view absolute_view absolute_row num_programs num_tiles".split()
 INTEGERS += ["rows_per_view", "halvings", "of_pairs", "num_parts", "row2d", "row_conic"]
 FLOATS = "exponent frequency beta1 beta2 log_beta1 log_beta2 eps l1_weight ssim_weight l2_weight".split()
-FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top near_plane clipped_from".split()
+FLOATS += "scale_x scale_y ssim_lambda half_width half_height reach_x reach_y penalty top near_plane".split()
+FLOATS += ["clipped_from"]
 POINTERS = {
     "view_ids": "*i64", "moved": "*u8",
     "radii": "*i32", "counts": "*i64", "order": "*i64", "ends": "*i64", "tiles": "*i16", "ids": "*i32",
