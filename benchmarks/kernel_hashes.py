@@ -256,7 +256,10 @@ def harmonics() -> Results:
 
 
 def losses() -> Results:
-    """Compare views with bytes, and with floats that are equal in one half; add a penalty to the second loss."""
+    """Compare views with bytes, also where they are clipped, and with floats that are equal in one half.
+
+    The last loss has a penalty.
+    """
     random = Random(7)
     shape = (2, 21, 47, 3)
     pixels = random.integers(0, 256, *shape).byte()
@@ -264,6 +267,8 @@ def losses() -> Results:
     predicted = floats + 0.1 * random.normal(*shape)
     to_bytes = partial(photometric_loss, target=pixels)
     found = named("bytes", with_gradients(random, to_bytes, {"predicted": predicted}))
+    to_clipped = partial(photometric_loss, target=pixels, clipped_from=0.5)
+    found |= named("clipped bytes", with_gradients(random, to_clipped, {"predicted": predicted}))
     predicted[:, :10] = floats[:, :10]
     inputs = {"predicted": predicted, "parts": random.uniform(-0.1, 0.3, 7)}
     to_floats = partial(photometric_loss, target=floats, ssim_lambda=0.3, l2_lambda=1.5)

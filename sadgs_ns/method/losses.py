@@ -137,12 +137,9 @@ def photometric_part(
     Returns:
         The part of the loss, and that of the mean square error, without gradient; both are scalars.
     """
-    if clipped_from is not None:
-        target = as_floats(target)
-        predicted = excuse_clipped(predicted, target, clipped_from)
     first, last = rows
     if last - first == height:
-        loss, psnr = photometric_loss(predicted, target, ssim_lambda=ssim_lambda)
+        loss, psnr = photometric_loss(predicted, target, ssim_lambda=ssim_lambda, clipped_from=clipped_from)
         return loss, torch.pow(10, -psnr / 10)
     # SSIM of the windows that are centred in these rows, and their share of all windows.
     reach = len(WINDOW) // 2
@@ -150,11 +147,17 @@ def photometric_part(
     end = min(last + reach, height)
     share_of_windows = (end - begin - 2 * reach) / (height - 2 * reach)
     in_windows = slice(begin - top, end - top)
-    dissimilarity, _ = photometric_loss(predicted[:, in_windows], target[:, in_windows], ssim_lambda=1.0, l2_lambda=0.0)
+    dissimilarity, _ = photometric_loss(
+        predicted[:, in_windows], target[:, in_windows], ssim_lambda=1.0, l2_lambda=0.0, clipped_from=clipped_from
+    )
     # L1 and L2 of these rows, and their share of all rows.
     share_of_rows = (last - first) / height
     own = slice(first - top, last - top)
-    difference = predicted[:, own] - as_floats(target[:, own])
+    of_rows = predicted[:, own]
+    target_of_rows = as_floats(target[:, own])
+    if clipped_from is not None:
+        of_rows = excuse_clipped(of_rows, target_of_rows, clipped_from)
+    difference = of_rows - target_of_rows
     l1 = difference.abs().mean()
     l2 = difference.square().mean()
     of_pixels = (1 - ssim_lambda) * l1 + L2_LAMBDA * l2

@@ -49,7 +49,7 @@ def project(
     backend = _backend(options.backend, gaussians.means.device)
     projected = backend.project(gaussians, cameras, options, begin_tiles)
     if color_maps is not None:
-        # There are fewer Gaussians than pixels, and their offsets leave the alphas without a gradient.
+        # Gaussians are mostly fewer than pixels, and their offsets give the pixels' alphas no gradient.
         factors, offsets = color_maps.detach()[:, :, None].unbind(dim=1)  # [C, 1, 3] each
         projected = projected._replace(colors=torch.addcmul(offsets, projected.colors, factors))
     return projected

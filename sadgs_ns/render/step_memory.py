@@ -36,6 +36,9 @@ after 8 the sort, sorted depths 4, the sort's buffers 12."""
 PROJECTION_GRADIENT_BYTES = 84
 """Bytes of a Gaussian and view besides, in the backward pass: a row of 12 gradients 48, and those that the projection
 wants contiguous or that are kept for AbsGS: means2d 8 + 8, conics 12, depths 4, opacities 4."""
+COLOR_MAP_BYTES = 12
+"""Bytes of a Gaussian and view besides, in every phase where views change colours (`rasterization.project`), which
+keeps the colours before and after that. The backward pass takes as many for the gradient."""
 EXCHANGE_BYTES = 200
 """Bytes of a Gaussian and view besides, in every phase, where several processes composite: its place 8, rows of 12
 numbers that are gathered, sent, received and taken apart 48 each. Every Gaussian counts as seen in each view."""
@@ -66,18 +69,22 @@ class StepSize:
     """Number of pairs of a Gaussian and a tile that it reaches, in all views, with the places of tile lists that a step
     left unused because their length was foreseen (render/tile_forecast.py)."""
     exchanged: bool = False  # Whether processes share the step out; pixels and pairs are then those of one.
+    has_color_maps: bool = False  # Whether views change the Gaussians' colours, as gains of exposure do
 
     @classmethod
     def of(cls, infos: Sequence[Mapping[str, Any]]) -> StepSize:
         """Return the size of a step that was rendered, from `info` of its views.
 
-        It is gsplat's, or that of `distributed.rasterization`, which alone has `num_pairs`.
+        It is gsplat's, or that of `distributed.rasterization`, which alone has `num_pairs`; a training step adds
+        `has_color_maps`.
         """
         views = 0
         pixels = 0
         pairs = 0
         exchanged = False
+        has_color_maps = False
         for info in infos:
+            has_color_maps = has_color_maps or info.get("has_color_maps", False)
             views += info["n_cameras"]
             pixels += info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"])
             if "num_pairs" in info:
@@ -85,7 +92,7 @@ class StepSize:
                 pairs += info["num_pairs"]
             else:
                 pairs += len(info["flatten_ids"])
-        return cls(views, pixels, pairs, exchanged)
+        return cls(views, pixels, pairs, exchanged, has_color_maps)
 
 
 def available_bytes(device: torch.device) -> tuple[float, float]:
@@ -164,9 +171,13 @@ def _phases(size: StepSize, device: torch.device) -> dict[str, _Phase]:
     per_view = PROJECTION_BYTES
     if size.exchanged:
         per_view += EXCHANGE_BYTES
+    of_gradients = PROJECTION_GRADIENT_BYTES
+    if size.has_color_maps:
+        per_view += COLOR_MAP_BYTES
+        of_gradients += COLOR_MAP_BYTES
     projected = ACTIVATION_BYTES + per_view * size.views
     sorted_by_depth = projected + DEPTH_SORT_BYTES * size.views
-    gradients = ACTIVATION_GRADIENT_BYTES + PROJECTION_GRADIENT_BYTES * size.views
+    gradients = ACTIVATION_GRADIENT_BYTES + of_gradients * size.views
     loss_pixel = TORCH_LOSS_PIXEL_BYTES
     if use_triton(device):
         loss_pixel = LOSS_PIXEL_BYTES

@@ -145,6 +145,7 @@ def _render_and_compare(
         pictures, info = rasterize(world, gaussians, cameras, group.options, color_maps)
         viewmats, Ks = cameras[:2]
         info |= {"viewmats": viewmats.detach(), "Ks": Ks, "structure_tensors": group.structure_tensors}
+        info["has_color_maps"] = color_maps is not None
         model.strategy.step_pre_backward(model.gauss_params, {}, model.strategy_state, model.step, info)
         infos.append(info)
         for band, colors, alphas in pictures:

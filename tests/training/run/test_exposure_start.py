@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.models.splatfacto import SH2RGB
 from numpy.testing import assert_allclose
 from PIL import ExifTags, Image
+from torch import Tensor
 from torch.testing import assert_close
 
 from benchmarks.evaluate import quality
@@ -26,11 +28,14 @@ from helpers.short_runs import configure, nerfstudio_data, train
 from sadgs_ns.cli.measuring import outputs_of_file
 from sadgs_ns.cli.splat_file import Splat
 from sadgs_ns.distributed.world import World
+from sadgs_ns.geometry.point_colors import BRIGHTEST, apply_gains
+from sadgs_ns.method.losses import photometric_loss
 from sadgs_ns.training.config import SadgsTrainerConfig
 from sadgs_ns.training.model import SadgsModel
 from sadgs_ns.training.run import exposure_start
 from sadgs_ns.training.run.point_observations import PointObservations
 from sadgs_ns.training.run.trainer import SadgsTrainer
+from sadgs_ns.training.step.train_step import ViewGroup, training_step
 
 WIDTH = 64
 HEIGHT = 48
@@ -173,6 +178,77 @@ def test_other_options_train_without_gains(exposed: Path, tmp_path: Path):
         config = run_of(exposed, tmp_path / name)
         setattr(config.pipeline.model, name, change)
         assert set_up(config).pipeline.model.exposure is None
+
+
+def with_gains_of_pictures(model: SadgsModel, colors: Tensor, alphas: Tensor, views: list[int]) -> Tensor:
+    """Apply gains to finished pictures [C, H, W, 3], as the method is written down."""
+    assert model.exposure is not None
+    gains = model.exposure.gains()[views].float()
+    pictures = [apply_gains(colors[c], gains[c], alphas[c]) for c in range(len(views))]
+    return torch.stack(pictures)
+
+
+def test_a_step_compares_photos_with_pictures_at_their_exposure_and_excuses_clipped_pixels(
+    exposed: Path, tmp_path: Path
+):
+    config = run_of(exposed, tmp_path)
+    config.pipeline.views_per_iteration = 2
+    pipeline = set_up(config).pipeline
+    model = pipeline.model
+    model.train()
+    model.gauss_params["features_dc"].data += 10.0  # Brighter than white in many pixels
+    assert model.exposure is not None
+    for _ in range(VIEWS):
+        (group,) = pipeline.next_views(0)
+        if model.exposure.stops[group.indices].std() > 0.5:  # Views of one gain would hide a mistake.
+            break
+    image = group.batch(None)["image"].clone()
+    image[:, : HEIGHT // 2] = 255
+    group = replace(group, images=image)
+    views = group.indices
+    assert model.exposure.stops[views].std() > 0.5
+
+    result = training_loss(model, [group])
+    colors, alphas, _ = model.render(group.cameras, group.options)
+    gained = with_gains_of_pictures(model, colors, alphas, views)
+    photo = image / 255
+    excused = torch.where((photo > BRIGHTEST) & (gained > photo), photo, gained)
+    expected, _ = photometric_loss(excused, photo, ssim_lambda=model.config.ssim_lambda)
+    not_excused, _ = photometric_loss(gained, photo, ssim_lambda=model.config.ssim_lambda)
+    plain, _ = photometric_loss(colors, photo, ssim_lambda=model.config.ssim_lambda)
+    assert_close(result, expected.detach())
+    for other in (not_excused, plain):
+        assert abs(other.detach() - expected.detach()) > 0.01
+
+
+def training_loss(model: SadgsModel, groups: list[ViewGroup]) -> Tensor:
+    """Return the loss of a step whose update does nothing."""
+
+    class NoUpdate:
+        parameters = ("means",)
+
+        def launch(self, *arguments: Any) -> None:
+            pass
+
+    nothing: Any = NoUpdate()
+    return training_step(model, groups, 0.0, nothing, torch.zeros(0), torch.zeros(1)).loss
+
+
+def test_what_moved_is_judged_by_pictures_at_the_photos_exposure(exposed: Path, tmp_path: Path):
+    pipeline = set_up(run_of(exposed, tmp_path)).pipeline
+    model = pipeline.model
+    gaussians, _ = model.gaussians()
+    views = [2, 3]
+    with torch.no_grad():
+        drawn, depths, cameras = pipeline.moved_search._draw(gaussians, views)
+        options = model.color_options(expected_depth=True)
+        colors, alphas, _ = model.render(cameras, options)
+        gained = with_gains_of_pictures(model, colors[..., :3], alphas, views).clamp(0, 1)
+        assert_close(drawn, gained.movedim(-1, 1))
+        assert (gained - colors[..., :3].clamp(0, 1)).abs().max() > 0.05
+        plain = torch.where(depths > 0, colors[..., 3], 0.0)
+        assert_close(depths, plain)
+        assert (depths > 0).float().mean() > 0.2
 
 
 def test_a_resumed_run_has_the_same_gains_bit_for_bit(exposed: Path, tmp_path: Path, monkeypatch: Any):

@@ -104,6 +104,17 @@ def test_what_a_gaussian_takes_is_what_a_split_asks_for():
         assert found == [grown, max(grown - 1, 0)]
 
 
+def test_gains_take_the_colours_once_more_in_each_phase_and_their_gradient_in_the_last():
+    cpu = torch.device("cpu")
+    plain = step_memory.step_bytes(1000, StepSize(3, 10**6, 10**5), cpu)
+    info = {"n_cameras": 3, "width": 1000, "height": 1000, "flatten_ids": torch.zeros(10**5), "has_color_maps": True}
+    size = StepSize.of([info])
+    assert size == StepSize(3, 3 * 10**6, 10**5, has_color_maps=True)
+    gained = step_memory.step_bytes(1000, StepSize(3, 10**6, 10**5, has_color_maps=True), cpu)
+    more = {name: gained[name] - plain[name] for name in plain}
+    assert more == {"tile lists": 36000, "loss": 36000, "backward": 72000}
+
+
 def test_each_phase_counts_what_it_grows_with():
     def peak(n: int = 1000, views: int = 1, pixels: int = 10**6, pairs: int = 10**5) -> dict[str, float]:
         return step_memory.step_bytes(n, StepSize(views, pixels, pairs), torch.device("cpu"))
