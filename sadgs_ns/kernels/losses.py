@@ -259,8 +259,9 @@ class _PhotometricLoss(torch.autograd.Function):
         grid, rows = _strips(views, height, row)
         slopes = x.new_empty(_MARGIN.value + 3 * n)
         sums = x.new_empty((3, math.prod(grid)))
-        excuses = clipped_from is not None
-        ctx.clipped = (clipped_from if excuses else 0.0, excuses)
+        ctx.clipped = (0.0, False)  # Without EXCUSES the kernels ignore the value.
+        if clipped_from is not None:
+            ctx.clipped = (clipped_from, True)
         _similarity[grid](x, y, slopes, sums, n, height, row, rows, *ctx.clipped, window, _COLUMNS)
         ctx.save_for_backward(x, y, slopes)
         ctx.window = window

@@ -82,9 +82,8 @@ class StepSize:
         pixels = 0
         pairs = 0
         exchanged = False
-        has_color_maps = False
+        has_color_maps = any(info.get("has_color_maps", False) for info in infos)
         for info in infos:
-            has_color_maps = has_color_maps or info.get("has_color_maps", False)
             views += info["n_cameras"]
             pixels += info.get("num_pixels", info["n_cameras"] * info["width"] * info["height"])
             if "num_pairs" in info:

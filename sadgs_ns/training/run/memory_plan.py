@@ -41,13 +41,13 @@ class TrainingSize:
 
 
 def training_size(
-    datamanager: FullImageDatamanager, views: int, processes: int = 1, has_gains: bool = False
+    datamanager: FullImageDatamanager, views: int, processes: int = 1, has_color_maps: bool = False
 ) -> TrainingSize:
     """Measure a run with this many views a step, shared out to processes, without opening an image."""
     cameras = datamanager.train_dataset.cameras
     largest = int((cameras.height * cameras.width).max())
     pixels = math.ceil(views * largest / processes)  # A process composites its share.
-    step = StepSize(views, pixels, exchanged=processes > 1, has_color_maps=has_gains)
+    step = StepSize(views, pixels, exchanged=processes > 1, has_color_maps=has_color_maps)
     if datamanager.config.cache_images == "gpu":
         return TrainingSize(image_bytes(datamanager), step)
     sizes = [(height, width) for height, width in torch.cat([cameras.height, cameras.width], dim=-1).tolist()]

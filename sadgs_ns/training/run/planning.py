@@ -212,8 +212,8 @@ def _cap_in_memory(pipeline: SadgsPipeline, views: int) -> int:
     params: Any = pipeline.model.gauss_params
     world = pipeline.model.world
     requested = pipeline.config.model.strategy.max_gaussians
-    has_gains = pipeline.model.exposure is not None
-    size = training_size(pipeline.datamanager, views, world.num_ranks, has_gains)
+    has_color_maps = pipeline.model.exposure is not None
+    size = training_size(pipeline.datamanager, views, world.num_ranks, has_color_maps)
     cap, sentence = fit_to_memory(requested, params, size, pipeline.config.memory_budget_gb, world.num_ranks)
     note(sentence)
     return int(world.least(cap))
