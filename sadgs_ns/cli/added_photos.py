@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from sadgs_ns.cli.division import divide, divide_additions, divides
@@ -15,7 +16,9 @@ from sadgs_ns.files import write_json
 def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
     """Divide the views of a scene that is new or has grown, and begin another run if one began with fewer views.
 
-    Nothing changes if the present run began with these views. Options that divide them are left to do it.
+    Nothing changes if the present run began with these views. Options that divide them are left to do it. Of a scene
+    that has grown the frame and the held-out views of the last run stay, also if the present run has other options and
+    has saved nothing yet.
     """
     settings = folder.settings
     views = folder.views()
@@ -23,12 +26,14 @@ def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
     has_checkpoint = folder.checkpoint() is not None
     if views == before and (has_checkpoint or settings.measure is None):
         return
+    last_run = folder.last_run()
     file = folder.scene / "transforms.json"
     described = json.loads(file.read_bytes())
     has_frame = FRAME_KEYS[0] in described
-    has_earlier = has_checkpoint or has_frame
-    if before and has_checkpoint and not has_frame:
-        _keep_frame(folder, described)
+    has_earlier = last_run is not None or has_frame
+    has_grown = bool(before) and views != before
+    if has_grown and last_run is not None and not has_frame:
+        _keep_frame(last_run, described)
     if not divides(train_options):
         if settings.measure is None:
             if before and has_earlier:
@@ -46,9 +51,9 @@ def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
     folder.write_settings()
 
 
-def _keep_frame(folder: SadgsFolder, described: dict[str, Any]) -> None:
-    """Note in a scene's description how the present run moved its images."""
-    moved = json.loads((folder.run / TRANSFORMS_NAME).read_bytes())
+def _keep_frame(run: Path, described: dict[str, Any]) -> None:
+    """Note in a scene's description how a run moved its images."""
+    moved = json.loads((run / TRANSFORMS_NAME).read_bytes())
     transform_key, scale_key = FRAME_KEYS
     described[transform_key] = moved["transform"]
     described[scale_key] = moved["scale"]

@@ -190,6 +190,16 @@ class SadgsFolder:
         """Return the last checkpoint of the present run."""
         return max(self.run.glob("nerfstudio_models/step-*.ckpt"), default=None)
 
+    def last_run(self) -> Path | None:
+        """Return the folder of the last run that saved a checkpoint, which is the present run if that did."""
+        if self.checkpoint() is not None:
+            return self.run
+        checkpoints = self.runs.glob("run*/nerfstudio_models/step-*.ckpt")
+        last = max(checkpoints, key=lambda file: file.stat().st_mtime, default=None)
+        if last is None:
+            return None
+        return last.parents[1]
+
     def trained(self) -> str | None:
         """Return the sentence of a finished training, None if there is none or its checkpoint was deleted."""
         if self.checkpoint() is None:

@@ -83,6 +83,51 @@ def test_until_something_is_trained_the_division_may_be_another_one(tmp_path: Pa
         assert len(described["train_filenames"]) == 20 - held_out
 
 
+@pytest.mark.hard_case(
+    "photos are added to a folder of `sadgs`, which gets another `--effort` in the same command",
+    "the held-out photos and the coordinates stay, and the earlier splat is kept",
+)
+def test_held_out_views_and_frame_stay_when_photos_and_options_change_at_once(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    write_scene(folder, VIEWS[:10])
+    folder.settings.measure = True
+    choose_run(folder, [])
+    held_out = read_json(folder.scene / "transforms.json")["test_filenames"]
+    moved = {"transform": [[1, 0, 0, 2], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0.5}
+    checkpoints = folder.run / "nerfstudio_models"
+    checkpoints.mkdir(parents=True)
+    (checkpoints / "step-000000007.ckpt").touch()
+    write_json(folder.run / "dataparser_transforms.json", moved)
+    folder.splat("ply").touch()
+
+    folder.begin_another_run()  # Its options differ, and it has saved nothing when the photos are placed.
+    run = folder.run
+    described = read_json(folder.scene / "transforms.json")
+    write_json(folder.scene / "transforms.json", described | {"frames": [{"file_path": name} for name in VIEWS]})
+    choose_run(folder, [])
+    grown = read_json(folder.scene / "transforms.json")
+    assert held_out == [VIEWS[0], VIEWS[8]]
+    assert grown["test_filenames"] == [*held_out, VIEWS[17]]
+    assert grown["dataparser_transform"] == moved["transform"]
+    assert grown["dataparser_scale"] == moved["scale"]
+    assert folder.run == run, "the run that was begun goes on"
+    assert (tmp_path / "earlier/run/splat.ply").is_file()
+
+
+def test_another_run_on_the_same_views_divides_them_alike_and_finds_its_own_frame(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    write_scene(folder, VIEWS)
+    folder.settings.measure = True
+    choose_run(folder, [])
+    first = read_json(folder.scene / "transforms.json")
+    checkpoints = folder.run / "nerfstudio_models"
+    checkpoints.mkdir(parents=True)
+    (checkpoints / "step-000000007.ckpt").touch()
+    folder.begin_another_run()
+    choose_run(folder, [])
+    assert read_json(folder.scene / "transforms.json") == first
+
+
 def test_options_of_ns_train_that_divide_the_views_do_it(tmp_path: Path):
     folder = SadgsFolder(tmp_path)
     write_scene(folder, VIEWS)
