@@ -140,7 +140,8 @@ def write_masks(
 ) -> int:
     """Write a mask for each photo `NAME` as it was `converted`, `NAME.png` in `target`, a white one if it has none.
 
-    Return how many of them hide something. Raise InputError if a mask has another shape than its photo.
+    Return how many of them hide something. Raise InputError if a mask has another shape than its photo, or transparent
+    parts.
     """
     num_hiding = 0
     names = iter(f"{photo.name}.png" for photo in converted)
@@ -161,8 +162,16 @@ def write_masks(
 
 
 def _read_mask(file: Path, photo: Photo, photo_file: Path) -> Image.Image:
-    """Read a mask, upright and in the photo's size, in black and white; raise InputError if it has another shape."""
+    """Read a mask, upright and in the photo's size, in black and white.
+
+    Raise InputError if it has another shape, or transparent parts, which may mean either of the two.
+    """
     with Image.open(file) as image:
+        if image.has_transparency_data:
+            image = image.convert("RGBA")
+            if image.getchannel("A").getextrema() != (255, 255):
+                problem = f"{file} is a mask with transparent parts"
+                raise InputError(f"{problem}: save it without transparency, black where {photo.name} is to be hidden.")
         mask = Image.fromarray(np.uint8(255 * valid_pixels(image)))
     width, height = photo.size
     lies_on_side = (mask.width > mask.height) != (width > height)

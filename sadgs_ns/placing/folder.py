@@ -38,6 +38,7 @@ _SERVICE = re.compile(r"(.*/)?(@eadir|@__thumb|[@#$]recycle(\.bin)?|__macosx|los
 """Files in folders of network drives and operating systems for thumbnails and deleted files."""
 _MAP = re.compile(r"(.*/)?(depths?|normals|confidence)(_?maps?)?/.*|.*[ ._-](depth|confidence)\.\w+", re.IGNORECASE)
 _MASK = re.compile(r"(.*/)?masks?(_\d+)?/.*|.*[ ._-]mask\.\w+", re.IGNORECASE)
+_GREY_SPREAD = 16  # Between the channels of a grey pixel, in steps of a byte; JPEG stores grey with small errors.
 _VARIANT = re.compile(r"(?<=^img_)e(?=\d)|[ ._-]*(mask|edited|copy|thumb|small)$")
 """Additions to a photo's name for its mask or a copy (IMG_E1 is the edited IMG_1), not the (1), (2) of Windows."""
 
@@ -169,7 +170,8 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
                 others = {"thumbnails or trash": _SERVICE, "depth or other maps": _MAP, "masks": _MASK}
                 kind = next((other for other, names in others.items() if names.fullmatch(name)), kind)
             found[kind].append(name)
-    maps = [name for name in found["masks"] if _is_mask(folder / name)]
+    photo_stems = {_stem(name) for name in found["photos"]}
+    maps = [name for name in found["masks"] if _is_mask(folder / name, _stem(name) in photo_stems)]
     photos = sorted({*found["photos"], *found["masks"]} - {*maps})
     found["copies of others"] = copies = _copies(folder, photos, known)
     found["panoramas of a part of the view"] = swept = [p for p in photos if p not in known and _is_swept(folder / p)]
@@ -217,14 +219,21 @@ def _stem(name: str) -> str:
     return stem.stem if stem.suffix in IMAGE_SUFFIXES | UNREAD_SUFFIXES else stem.name
 
 
-def _is_mask(path: Path) -> bool:
-    """Return whether an image has two colours at most, or nearly all of it is black or white."""
+def _is_mask(path: Path, is_of_photo: bool) -> bool:
+    """Return whether an image has two colours at most, or nearly all of it is black or white.
+
+    One that has a photo's name may have any greys, as of a soft edge or noise: otherwise it would become a photo.
+    """
     try:
         with Image.open(path) as image:
+            if image.has_transparency_data:  # From a palette Pillow would warn.
+                image = image.convert("RGBA")
             small = image.convert("RGB").resize((64, 64), Image.Resampling.NEAREST)
     except UNREADABLE:  # A damaged image is named when it is read.
         return False
     pixels = np.asarray(small).reshape(-1, 3)
+    if is_of_photo and np.ptp(pixels, axis=1).max() <= _GREY_SPREAD:
+        return True
     is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
     return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
 

@@ -919,7 +919,7 @@ def test_a_mistake_of_ours_is_not_taken_for_a_damaged_photo(tmp_path: Path, monk
     (tmp_path / "masks").mkdir()
     Image.radial_gradient("L").save(tmp_path / "masks/a.png")
     with monkeypatch.context() as patched, pytest.raises(KeyError, match="a mistake"):
-        patched.setattr(np, "unique", mistaken)
+        patched.setattr(np, "ptp", mistaken)
         look_into(tmp_path, tmp_path / "out")
 
 
@@ -1043,6 +1043,51 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path, taken: list[list[str
     status = main([str(photos), str(tmp_path / "out")])
     assert status == 130
     assert taken == [["a.png", "b.png", "c.png"]]
+
+
+@pytest.mark.hard_case(
+    "masks with soft edges, in black of 16 and white of 235, or as JPEG", "masks as others, and no photos"
+)
+def test_masks_of_any_greys_are_masks_if_a_photo_has_their_name(tmp_path: Path):
+    hard = Image.new("L", (WIDTH, HEIGHT), 235)
+    hard.paste(16, (40, 30, 120, 90))
+    soft = hard.filter(ImageFilter.GaussianBlur(15))
+    (tmp_path / "masks").mkdir()
+    for name, view in zip(("a.jpg", "b.jpg", "c.jpg", "flask_mask.jpg"), draw_photos(), strict=False):
+        view.save(tmp_path / name)
+    soft.save(tmp_path / "masks/a.png")
+    soft.convert("RGB").save(tmp_path / "masks/b.jpg")
+    hard.filter(ImageFilter.GaussianBlur(1)).save(tmp_path / "c_mask.png")
+    photos, masks, _ = look_into(tmp_path, tmp_path / "out")
+    assert masks == {"a.jpg": "masks/a.png", "b.jpg": "masks/b.jpg", "c.jpg": "c_mask.png"}
+    assert photos[-1] == "flask_mask.jpg", "a photo of something, which no other photo has the name of"
+    soft.save(tmp_path / "masks/statue.png")
+    assert "masks/statue.png" in look_into(tmp_path, tmp_path / "out")[0], "it may be a black and white photo"
+
+
+@pytest.mark.hard_case("a mask with transparent parts", "refused: save it without transparency")
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_a_mask_with_transparent_parts_is_refused(tmp_path: Path, mode: str, capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png")
+    (photos / "masks").mkdir()
+    with Image.open(photos / "b.png") as photo:
+        mask = Image.new("RGBA", photo.size, "white")
+    mask.putpixel((1, 1), (255, 255, 255, 0))
+    mask.convert(mode).save(photos / "masks/b.png")
+    status = main([str(photos), str(tmp_path / "out")])
+    assert status == 2
+    told = "masks/b.png is a mask with transparent parts: save it without transparency, black where b.png is to be hid"
+    assert told in capsys.readouterr().err
+
+
+def test_a_mask_without_transparent_parts_may_have_an_alpha_channel(tmp_path: Path):
+    mask = Image.new("RGBA", (32, 24), "white")
+    mask.paste("black", (0, 0, 16, 24))
+    mask.save(tmp_path / "mask.png")
+    photo = Photo("photo.png", (32, 24), (), False, is_panorama=False)
+    write_masks(tmp_path, {"photo.png": "mask.png"}, [photo], [photo], tmp_path / "masks")
+    with Image.open(tmp_path / "masks/photo.png.png") as written:
+        assert np.asarray(written).mean() == 127.5
 
 
 @pytest.mark.hard_case("photos whose names hold spaces or begin with #, on a CPU", "matched as others")
