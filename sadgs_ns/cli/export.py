@@ -303,7 +303,7 @@ def _load(run: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code, 2 if the run or the output cannot be used."""
+    """Run the command line and return its exit code, 2 if the run, the output or the GPU cannot be used."""
     options = parse(Export, "sadgs-export", argv)
     try:
         check_encoding(options.run)
@@ -311,6 +311,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         count = export(options)
     except (InputError, RunError, WriteError) as error:
         print(f"sadgs-export: {error}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:
+        import torch
+
+        if not isinstance(error, torch.cuda.OutOfMemoryError):
+            raise
+        remedy = "end other programs on it, or work on the CPU: CUDA_VISIBLE_DEVICES= sadgs-export …"
+        print(f"sadgs-export: the GPU's memory does not hold {options.run}: {remedy}", file=sys.stderr)
         return 2
     parts = "Gaussians"
     if format_of(options.output) == MESH:

@@ -35,6 +35,7 @@ from sadgs_ns.cli.export import Export
 from sadgs_ns.data.coordinates import Similarity, from_data, spherical_harmonics
 from sadgs_ns.data.run_cameras import find_capture, read_cameras
 from sadgs_ns.formats import FORMATS, html
+from sadgs_ns.geometry import cleaning
 from sadgs_ns.training.run.run_folder import write_config
 from sadgs_ns.training.run.trainer import SadgsTrainer
 
@@ -668,3 +669,29 @@ def test_a_full_disk_leaves_the_file_that_was_there(tmp_path: Path, capsys: pyte
     assert "a.ply could not be written (No space left on device; " in errors
     assert output.read_text() == "earlier"
     assert not partial.is_symlink()
+
+
+@pytest.mark.hard_case(
+    "a full GPU while `sadgs-export` looks from the training views", "one sentence that names the remedy"
+)
+def test_a_gpu_that_is_full_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 22.00 MiB.")
+
+    run = write_run(tmp_path / "run", gaussians(3))
+    monkeypatch.setattr(cleaning, "choose_remaining", full)
+    command = [str(run), "--output", str(tmp_path / "a.ply")]
+    status = export.main([*command, "--max-extent", "0.5"])
+    assert status == 2
+    told = f"sadgs-export: the GPU's memory does not hold {run}: end other programs on it, or work on the CPU: "
+    assert capsys.readouterr().err.startswith(told)
+    assert not (tmp_path / "a.ply").exists()
+
+    def mistaken(*_: Any, **__: Any) -> None:
+        raise RuntimeError("a mistake")
+
+    monkeypatch.setattr(cleaning, "choose_remaining", mistaken)
+    with pytest.raises(RuntimeError, match="a mistake"):
+        export.main([*command, "--max-extent", "0.5"])

@@ -49,6 +49,7 @@ def test_the_program_is_installed_once_without_running_scripts_of_its_packages(c
     assert page_writer.is_installed()
     actual = list(cache.iterdir())
     assert actual == [page_writer.folder()]
+    assert page_writer.folder().stat().st_mode & 0o777 == 0o755, "other users may use it, too"
     ran = (page_writer.folder() / "ran.txt").read_text().splitlines()
     assert len(ran) == 1
     assert ran[0].startswith("ci ")
