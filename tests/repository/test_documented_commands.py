@@ -41,7 +41,7 @@ else:
     import tomli as tomllib
 
 DOCUMENTS = [CHECKOUT / "README.md", *sorted((CHECKOUT / "docs").glob("*.md"))]
-OTHER_LANGUAGES = {"python", "text", "yaml", "{button-link}"}
+OTHER_LANGUAGES = {"dockerfile", "python", "text", "yaml", "{button-link}"}
 """Of fenced blocks that hold no commands."""
 FOREIGN = ("git", "cd", "cp", ".", "python3 -m venv", "pip install", "ns-install-cli", "docker run")
 """Commands of others that no change of this package breaks; what `pip` is given of the checkout must be there."""
