@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -44,8 +43,3 @@ class ExposureTable:
         gains = self.gains()
         offsets = OFFSET * (gains - 1)
         return torch.stack([gains, offsets], dim=1).float()
-
-
-def photo_names(files: Sequence[Path]) -> list[str]:
-    """Return the names by which photos are known again when a capture has more of them: file and folder."""
-    return ["/".join(file.parts[-2:]) for file in files]

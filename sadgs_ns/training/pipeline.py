@@ -30,9 +30,9 @@ from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
 from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
-from sadgs_ns.training.exposure_table import photo_names
 from sadgs_ns.training.model import NORMALS, SadgsModel
-from sadgs_ns.training.run.checkpoints import check_number_of_views
+from sadgs_ns.training.photo_names import photo_names
+from sadgs_ns.training.run.checkpoints import check_number_of_views, check_order_of_views
 from sadgs_ns.training.run.memory_plan import choose_image_storage
 from sadgs_ns.training.run.moved_search import MovedSearch
 from sadgs_ns.training.run.point_observations import PointObservations
@@ -49,6 +49,8 @@ from sadgs_ns.viewer.elements import shows_output
 from sadgs_ns.viewer.shown_run import ShownRun
 from sadgs_ns.viewer.structure_panel import StructurePanel
 
+_OF_VIEWS = {"_model.color_matrices", "_model.poses.table", "_model.camera_optimizer.pose_adjustment"}
+"""Tensors of a checkpoint that have a row for each training view."""
 _NAMED_STEPS = 5  # Number of iterations whose images a report of losses that are not finite names
 _SAMPLED = 1000  # About so many cameras and Gaussians suffice to find out whether training can see anything
 
@@ -376,6 +378,9 @@ class SadgsPipeline(VanillaPipeline):
             value = loaded.get(name)
             if ".gauss_params." not in name and value is not None:
                 check_number_of_views(name, value, parameter)
+        positions = camera_positions(self.datamanager.train_dataset.cameras)
+        for name in sorted(_OF_VIEWS & loaded.keys()):
+            check_order_of_views(name, loaded["_extra_state"].get("camera_positions"), positions)
         super().load_pipeline(loaded_state, step)
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -14,9 +14,11 @@ from torch import Tensor
 
 from sadgs_ns.errors import InputError, reason
 from sadgs_ns.files import atomic_path
+from sadgs_ns.geometry.extents import camera_extent
 from sadgs_ns.training.run.progress import warn
 
 REMEDY = "give --load-dir the folder of a run of sadgs, or train from scratch"
+SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' extent count as one
 _FOLDER = "nerfstudio_models"  # Name of the folder of checkpoints in a run's folder
 _PARTS = ("step", "pipeline", "optimizers", "scalers")  # Keys of every checkpoint of nerfstudio's trainer
 
@@ -112,6 +114,21 @@ def check_number_of_views(name: str, value: Tensor, expected: Tensor) -> None:
     if value.shape != expected.shape:
         problem = f"The checkpoint's {name} is for {len(value)} training views, and there are {len(expected)}"
         raise InputError(f"{problem}: set the parser's options that choose them as they were.")
+
+
+def check_order_of_views(
+    name: str,
+    before: Tensor | None,  # Positions of the checkpoint's training cameras [C, 3]
+    now: Tensor,  # Positions of the present ones [C, 3]
+) -> None:
+    """Raise InputError if the views to which a checkpoint's tensor belongs are not the present ones in their order."""
+    if before is None:  # Earlier versions did not store them.
+        return
+    check_number_of_views(name, before, now)
+    distances = (torch.as_tensor(before) - torch.as_tensor(now)).norm(dim=-1)
+    if (distances > SAME_PLACE * camera_extent(now)).any():
+        problem = f"The checkpoint's {name} is for other training views, or for these in another order"
+        raise InputError(f"{problem}: choose them, by transforms.json or the parser's options, as they were.")
 
 
 def map_rows(state: dict[str, Any], change: Callable[[Tensor], Tensor]) -> dict[str, Any]:

@@ -22,7 +22,8 @@ from sadgs_ns.geometry.exposure import (
     mean_gains,
     points_at_median,
 )
-from sadgs_ns.training.exposure_table import ExposureTable, photo_names
+from sadgs_ns.training.exposure_table import ExposureTable
+from sadgs_ns.training.photo_names import photo_names, same_photos
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.progress import note, warn
 
@@ -53,51 +54,50 @@ def start_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     """
     model = pipeline.model
     if not model.may_use_gains:
+        if model.config.exposure == "auto":
+            note("Gains of exposure are off, because a colour matrix is learned for each photo.")
         return
     found = _find(pipeline)
-    if found is None:
+    _use(pipeline, world, found)
+    if model.exposure is None or found is None or found.observations is None:
         return
-    used = torch.tensor([float(found.used)], device=world.device)
-    world.broadcast(used, 0)
-    note(found.sentence)
-    if not used.item():
-        return
-    stops = found.stops.to(world.device)
-    points = found.points.to(world.device)
-    world.broadcast(stops, 0)
-    world.broadcast(points, 0)
-    names = photo_names(pipeline.datamanager.train_dataset.image_filenames)
-    model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
-    if found.observations is not None:
-        shown_in, shown = _photos_of_points(pipeline, found.observations)
-        means = mean_gains(shown_in, shown, stops.cpu().numpy(), len(points))
-        model.color_points(torch.from_numpy(means).float())
+    shown_in, shown = _photos_of_points(pipeline, found.observations)
+    means = mean_gains(shown_in, shown, model.exposure.stops.numpy(), len(found.points))
+    model.color_points(torch.from_numpy(means).float())
 
 
 def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     """Keep the gains of a checkpoint that was loaded, and find those of photos that were added since.
 
-    The gains of the others do not change, and so neither does the median. Without gains in the checkpoint, or if the
-    options ask for none, the run goes on without.
+    The gains of the others do not change, and so neither does the median. If none of the photos is known, all gains are
+    found anew. Without gains in the checkpoint, or if the options ask for none, the run goes on without, and a line
+    says so.
     """
     model = pipeline.model
     before = model.exposure
     if before is None:
+        if model.may_use_gains:
+            note("Gains of exposure: the checkpoint has none, and so has this run.")
         return
     if not model.may_use_gains:
+        note("Gains of exposure: the options ask for none, so those of the checkpoint are dropped.")
         model.set_exposure(None)
         return
     dataset = pipeline.datamanager.train_dataset
     names = photo_names(dataset.image_filenames)
     if names == before.names:
         return
-    rows = {name: row for row, name in enumerate(before.names)}
     stops = torch.zeros((len(names), 3), dtype=torch.float64)
     kept = np.zeros(len(names), bool)
-    for view, name in enumerate(names):
-        if name in rows:
-            stops[view] = before.stops[rows[name]]
+    for view, row in enumerate(same_photos(before.names, names)):
+        if row is not None:
+            stops[view] = before.stops[row]
             kept[view] = True
+    if not kept.any():
+        note("Gains of exposure are found anew, because no photo has the name of one that the checkpoint knows.")
+        model.set_exposure(None)
+        _use(pipeline, world, _find(pipeline))
+        return
     points = before.points
     point_observations = pipeline.point_observations("train")
     if point_observations is not None:
@@ -113,6 +113,24 @@ def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
     world.broadcast(points, 0)
     model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
     note(f"Gains of exposure: {int(kept.sum())} photos keep theirs, {int((~kept).sum())} were added.")
+
+
+def _use(pipeline: SadgsPipeline, world: World, found: _Found | None) -> None:
+    """Let the model use gains that were found, if exposure varies, and print a line about it."""
+    if found is None:
+        note("Gains of exposure are off: neither points nor EXIF tell how the photos were exposed.")
+        return
+    used = torch.tensor([float(found.used)], device=world.device)
+    world.broadcast(used, 0)
+    note(found.sentence)
+    if not used.item():
+        return
+    stops = found.stops.to(world.device)
+    points = found.points.to(world.device)
+    world.broadcast(stops, 0)
+    world.broadcast(points, 0)
+    names = photo_names(pipeline.datamanager.train_dataset.image_filenames)
+    pipeline.model.set_exposure(ExposureTable(names, stops.cpu(), points.cpu()))
 
 
 def _find(pipeline: SadgsPipeline) -> _Found | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,6 +23,7 @@ from sadgs_ns.geometry.moved import Group, SmallView, Spread
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
+from sadgs_ns.training.photo_names import common_folder
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 from sadgs_ns.training.step.images import thread_count
@@ -259,11 +259,6 @@ class MovedSearch:
             with atomic_path(folder / name) as partial:
                 picture.save(partial, format="PNG")
         return folder
-
-
-def common_folder(files: Sequence[Path]) -> Path:
-    """Return the folder that holds all files, in it or below."""
-    return Path(os.path.commonpath([file.parent for file in files]))
 
 
 def verdict(groups: Sequence[Group], threads: int = 1) -> Verdict:

@@ -15,7 +15,7 @@ from sadgs_ns.gsplat_compat import NEAR_PLANE
 from sadgs_ns.method.schedule import Schedule, dropout, growth_threshold, schedule
 from sadgs_ns.method.strategy import StructureAwareStrategy
 from sadgs_ns.render.rasterization import viewmats_from_camera_to_world
-from sadgs_ns.training.config import SadgsModelConfig, SadgsPipelineConfig, SadgsTrainerConfig
+from sadgs_ns.training.config import SadgsModelConfig, SadgsTrainerConfig
 from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run.memory_plan import fit_to_memory, training_size
 from sadgs_ns.training.run.progress import cpu_notice, note, warn
@@ -27,6 +27,7 @@ SSIM was higher with it on all of four scenes (docs/results.md#dense-start)."""
 LEAST_PIXELS = 1.5e6
 """Pixels of a step on each of several devices, below which one is quicker. With 1.9 and 3 million, two devices took
 1/1.1 of the time of one (1/1.3 in one run), and with .7 million 2.3 times as long (docs/results.md#several-devices)."""
+_OPTIMIZERS = "optimizers."  # With this begin the names of options of learning rates.
 _CAP_OPTIONS = ("memory_budget_gb", "model.strategy.max_gaussians")
 _THRESHOLD_OPTIONS = ("effort", "model.strategy.clone_grad2d", "model.strategy.split_absgrad2d")
 
@@ -111,7 +112,7 @@ def plan_run(
     The pipeline has the Gaussians from which this process starts, which is `dense` if stereo depth was added. `before`
     is the plan of the checkpoint's run, after `done` iterations. Raises InputError if the memory holds no Gaussians.
     """
-    requested = _requested_options(config.pipeline)
+    requested = _requested_options(config)
     _warn_of_other_settings(requested, before)
     views = len(pipeline.datamanager.train_dataset)
     strategy = _plan_strategy(pipeline, length, requested, dense, before)
@@ -144,8 +145,9 @@ def plan_dropout(option: float | None, length: Schedule, views: int, before: Run
     return dropout(length, views)
 
 
-def _requested_options(options: SadgsPipelineConfig) -> dict[str, Any]:
-    """Return the options from which a plan is derived, by their names after `pipeline.`."""
+def _requested_options(config: SadgsTrainerConfig) -> dict[str, Any]:
+    """Return the options from which a plan is derived, by their names, those of the pipeline without `pipeline.`."""
+    options = config.pipeline
     requested: dict[str, Any] = {
         "effort": options.effort,
         "views_per_iteration": options.views_per_iteration,
@@ -153,6 +155,8 @@ def _requested_options(options: SadgsPipelineConfig) -> dict[str, Any]:
     }
     for name, value in asdict(options.model.strategy).items():
         requested[f"model.strategy.{name}"] = value
+    for name, group in config.optimizers.items():
+        requested[f"{_OPTIMIZERS}{name}.optimizer.lr"] = group["optimizer"].lr
     return requested
 
 
@@ -164,7 +168,10 @@ def _warn_of_other_settings(requested: Mapping[str, Any], before: RunPlan | None
     for name, value in requested.items():
         value_before = before.requested.get(name, value)  # An earlier version may not have had the option.
         if value_before != value:
-            changed.append(f"pipeline.{name} was {value_before} and is {value}")
+            option = f"pipeline.{name}"
+            if name.startswith(_OPTIMIZERS):
+                option = name
+            changed.append(f"{option} was {value_before} and is {value}")
     if changed:
         warn(f"The checkpoint's run had other settings; this one goes on with its own: {', '.join(changed)}.")
 

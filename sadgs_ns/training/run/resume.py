@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TrainerConfig
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -22,8 +21,7 @@ from sadgs_ns.training.pipeline import SadgsPipeline
 from sadgs_ns.training.run import checkpoints
 from sadgs_ns.training.run.progress import note, warn
 from sadgs_ns.training.run.run_plan import RunPlan
-
-_SAME_PLACE = 1e-3  # Cameras that are closer than this share of the cameras' extent count as one
+from sadgs_ns.training.step.optimizers import SadgsOptimizers
 
 
 @dataclass
@@ -97,12 +95,15 @@ class Resumption:
                     "pipeline.model.poses as they were, and train on one device."
                 )
 
-    def load_optimizers(self, optimizers: Optimizers, schedulers: bool) -> None:
-        """Load the optimizers and, if asked for, their schedulers, and print where the run goes on."""
+    def load_optimizers(self, optimizers: SadgsOptimizers, schedulers: bool) -> None:
+        """Load the optimizers' moments, and print where the run goes on.
+
+        The rates are those of this run's plan, of its first iteration unless the `schedulers` are to go on.
+        """
         with self._errors_name_file():
             optimizers.load_optimizers(self.state["optimizers"])
-            if "schedulers" in self.state and schedulers:
-                optimizers.load_schedulers(self.state["schedulers"])
+            if schedulers:
+                optimizers.go_on_after(self.state["step"] + 1)
         note(f"Resuming after step {self.state['step']} of {self.path}")
 
 
@@ -117,7 +118,7 @@ def check_same_capture(pipeline: SadgsPipeline, names_before: Sequence[str], pos
     names = [path.name for path in dataset.image_filenames]
     positions = camera_positions(dataset.cameras)
     distances, _ = KDTree(positions).query(positions_before)  # [C]
-    num_same = int((distances < _SAME_PLACE * camera_extent(positions)).sum())
+    num_same = int((distances < checkpoints.SAME_PLACE * camera_extent(positions)).sum())
     if 2 * num_same < min(len(names_before), len(names)):
         raise InputError(
             "It was trained on other data, or with other options of the parser: of its "

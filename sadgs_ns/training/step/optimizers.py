@@ -170,6 +170,25 @@ class SadgsOptimizers(Optimizers):
         # nerfstudio would keep the first parameters, which densification replaces, to clip their gradients.
         self.parameters.clear()
 
+    def load_optimizers(self, loaded_state: dict[str, Any]) -> None:
+        """Take over a checkpoint's moments and counts of steps; rates, betas and eps stay those of this run."""
+        for name, state in loaded_state.items():
+            optimizer = self.optimizers[name]
+            own_groups = optimizer.state_dict()["param_groups"]
+            optimizer.load_state_dict({**state, "param_groups": own_groups})
+
+    def go_on_after(self, iterations: int) -> None:
+        """Set the rates to those of this run's schedules after some iterations, also where a checkpoint had none."""
+        for scheduler in self.schedulers.values():
+            assert isinstance(scheduler, LambdaLR)
+            (base,) = scheduler.base_lrs
+            (factor,) = scheduler.lr_lambdas
+            rate = base * factor(iterations)
+            scheduler.last_epoch = iterations
+            scheduler._step_count = iterations + 1
+            scheduler._last_lr = [rate]
+            scheduler.optimizer.param_groups[0]["lr"] = rate
+
     def update(self) -> AdamUpdate:
         """Return an update of all present parameters that are not empty."""
         adams: Any = self.optimizers.items()

@@ -287,6 +287,56 @@ def test_added_photos_do_not_move_the_gains_of_earlier_ones(exposed: Path, tmp_p
     assert_allclose(actual, training_stops() + shift, atol=0.06)
 
 
+@pytest.mark.hard_case(
+    "a run with gains is resumed after its photos' folder was renamed, or with photos of other names",
+    "the gains stay, or are found anew",
+)
+@pytest.mark.parametrize("name", ["images", "photo"])
+def test_gains_stay_if_the_folder_has_another_name_and_are_found_anew_with_unknown_photos(
+    name: str, exposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = train(run_of(exposed, tmp_path / "first")).pipeline.model.exposure
+    trainer = set_up(run_of(exposed, tmp_path / "again", iterations=4))
+    pipeline = trainer.pipeline
+    assert before is not None
+    files: Any = pipeline.datamanager.train_dataset.image_filenames
+    files[:] = [path.parent.with_name("renamed") / path.name.replace("image", name) for path in files]
+    if name == "photo":
+        files[:] = [path.with_name(f"photo_{path.name}") for path in files]
+    pipeline.model.set_exposure(before)
+    colors = pipeline.model.gauss_params["features_dc"].clone()
+    exposure_start.resume_with_gains(pipeline, pipeline.model.world)
+    after = pipeline.model.exposure
+    assert after is not None
+    printed = " ".join(capsys.readouterr().out.split())
+    if name == "images":
+        assert torch.equal(after.stops, before.stops)
+        assert f"{len(files)} photos keep theirs, 0 were added" in printed
+    else:
+        assert "found anew, because no photo has the name of one that the checkpoint knows" in printed
+        assert_allclose(after.stops.numpy(), before.stops.numpy(), atol=1e-6)
+    assert after.names[0].startswith("renamed/")
+    assert torch.equal(pipeline.model.gauss_params["features_dc"], colors), "the Gaussians were trained already"
+
+
+@pytest.mark.hard_case(
+    "`exposure auto` where it can do nothing: with learned colour matrices, or a checkpoint without gains",
+    "a line says so",
+)
+def test_a_line_tells_why_there_are_no_gains(exposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = run_of(exposed, tmp_path / "first")
+    config.pipeline.model.color_model = "affine"
+    train(config)
+    assert "Gains of exposure are off, because a colour matrix" in " ".join(capsys.readouterr().out.split())
+    config = run_of(exposed, tmp_path / "second")
+    config.pipeline.model.exposure = "off"
+    train(config)
+    config = run_of(exposed, tmp_path / "again", iterations=4)
+    config.load_dir = tmp_path / "second/test/sadgs/run/nerfstudio_models"
+    set_up(config)
+    assert "the checkpoint has none, and so has this run" in " ".join(capsys.readouterr().out.split())
+
+
 def exposures_together(world: World, config: SadgsTrainerConfig) -> dict[str, Any]:
     """Train in several processes, as `exposures_of` in one."""
     return exposures_of(set_up_together(world, config))

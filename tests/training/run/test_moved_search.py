@@ -20,7 +20,7 @@ from helpers.short_runs import nerfstudio_data
 from sadgs_ns.data.images import valid_pixels
 from sadgs_ns.distributed.world import World
 from sadgs_ns.training.config import SadgsTrainerConfig
-from sadgs_ns.training.run.moved_search import MovedSearch, common_folder, judged_steps
+from sadgs_ns.training.run.moved_search import MovedSearch, judged_steps
 from sadgs_ns.training.run.trainer import SadgsTrainer
 
 WIDTH, HEIGHT, VIEWS, POINTS = 64, 48, 20, 500
@@ -269,10 +269,3 @@ def test_several_processes_find_what_one_finds(disturbed: tuple[Path, Any], foun
     for result in run_ranks(regions_together, 2, tmp_path / "meet", config):
         assert result.keys() == expected.keys()
         assert all(overlap(result[view], expected[view]) > 0.95 for view in expected)
-
-
-def test_masks_lie_as_their_photos_do():
-    actual = common_folder([Path("a/b/1.png"), Path("a/c/1.png")])
-    assert actual == Path("a")
-    actual = common_folder([Path("a/b/1.png"), Path("a/b/2.png")])
-    assert actual == Path("a/b")

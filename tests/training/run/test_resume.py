@@ -734,6 +734,58 @@ def test_what_is_learned_of_each_view_goes_on_with_the_same_views_and_options_al
         set_up(config)
 
 
+@pytest.mark.hard_case(
+    "a checkpoint with matrices of colours, resumed with as many views, of which some are others",
+    "refused: each matrix belongs to a photo",
+)
+def test_what_is_learned_of_each_view_is_not_given_to_another(config: SadgsTrainerConfig, tmp_path: Path):
+    config.pipeline.model.color_model = "affine"
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    (checkpoint,) = trainer.checkpoint_dir.iterdir()
+    state = torch.load(checkpoint, weights_only=True)
+    positions = state["pipeline"]["_extra_state"]["camera_positions"]
+    state["pipeline"]["_extra_state"]["camera_positions"] = positions.roll(1, dims=0)
+    torch.save(state, checkpoint)
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
+    with refusal(r"\S+color_matrices is for other training views, or for these in another order: choose them"):
+        set_up(config)
+
+
+@pytest.mark.hard_case(
+    "a run is resumed with another number of views a step, or with other learning rates",
+    "it goes on with the rates that its plan names, at its iteration",
+)
+@pytest.mark.parametrize(("before", "now"), [(4, 1), (1, 4), (2, 2)])
+def test_a_resumed_run_has_the_rates_of_its_plan(
+    before: int, now: int, config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config.pipeline.views_per_iteration = before
+    trainer = short_runs.train(config)
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
+    config.max_num_iterations = 2 * ITERATIONS
+    config.pipeline.views_per_iteration = now
+    config.optimizers["features_dc"]["optimizer"].lr = 0.25
+    capsys.readouterr()
+    resumed = set_up(config)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "optimizers.features_dc.optimizer.lr was 0.0025 and is 0.25" in printed
+    plan = resumed.pipeline.model.plan
+    adams = resumed.optimizers.optimizers
+    assert plan.rates["features_dc"].lr == 0.25
+    for name, rate in plan.rates.items():
+        expected = rate.lr
+        if name in resumed.optimizers.schedulers:
+            scheduler = resumed.optimizers.schedulers[name]
+            assert scheduler.last_epoch == ITERATIONS
+            expected *= scheduler.lr_lambdas[0](ITERATIONS)
+        assert adams[name].param_groups[0]["lr"] == pytest.approx(expected)
+        assert "exp_avg" in adams[name].state[adams[name].param_groups[0]["params"][0]]
+    assert ("quats" in resumed.optimizers.schedulers) == (now > 1)
+
+
 @pytest.mark.hard_case("a checkpoint of the same cameras with images of other names (a rig)", "goes on with a warning")
 def test_images_with_other_names_at_the_same_cameras_are_told_of(
     finished: Path, config: SadgsTrainerConfig, capsys: pytest.CaptureFixture[str]
