@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,8 @@ def write_cameras(path: Path, pipeline: Mapping[str, Any], cameras: RunCameras, 
         poses = torch.from_numpy(similarity.poses(poses.double().numpy()))
     frames = []
     for index, pose in enumerate(poses.tolist()):
-        frames.append(_frame(cameras, index) | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
+        image = os.path.relpath(cameras.images[index].absolute(), path.absolute().parent)
+        frames.append({"file_path": image} | _frame(cameras, index) | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
     content = {"camera_model": cameras.camera_model, **frame, "frames": frames}
     with atomic_path(path) as partial:
         partial.write_text(json.dumps(content, indent=2), "utf8")
@@ -75,10 +77,10 @@ def _check_images(pipeline: Mapping[str, Any], cameras: RunCameras) -> None:
 
 
 def _frame(cameras: RunCameras, index: int) -> dict[str, Any]:
-    """Return a camera's image, size, intrinsics and distortion as a frame of `transforms.json` has them."""
+    """Return a camera's size, intrinsics and distortion as a frame of `transforms.json` has them."""
     K = cameras.Ks[index].tolist()
     width, height = cameras.sizes[index]
-    frame: dict[str, Any] = {"file_path": str(cameras.images[index]), "w": width, "h": height}
+    frame: dict[str, Any] = {"w": width, "h": height}
     frame |= {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
     if cameras.distortion is not None:
         frame |= dict(zip(_COEFFICIENTS, cameras.distortion[index].tolist(), strict=False))

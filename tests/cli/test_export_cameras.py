@@ -54,7 +54,8 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     content = json.loads(file.read_text("utf8"))
     files = trainer.pipeline.datamanager.train_dataset.image_filenames
     actual = [frame["file_path"] for frame in content["frames"]]
-    assert actual == [str(path) for path in files]
+    assert [(file.parent / name).resolve() for name in actual] == [path.resolve() for path in files]
+    assert not any(Path(name).is_absolute() for name in actual), "so that it holds also for a run on a relative folder"
 
     arguments = ["--output", str(tmp_path / "splat.ply"), "--cameras", str(file), "--frame", "colmap"]
     status = export.main([str(run), *arguments])
