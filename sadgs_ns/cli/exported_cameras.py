@@ -47,7 +47,8 @@ def write_cameras(path: Path, pipeline: Mapping[str, Any], cameras: RunCameras, 
     frames = []
     for index, pose in enumerate(poses.tolist()):
         image = os.path.relpath(cameras.images[index].absolute(), path.absolute().parent)
-        frames.append({"file_path": image} | _frame(cameras, index) | {"transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]]})
+        transform = [*pose, [0.0, 0.0, 0.0, 1.0]]
+        frames.append({"file_path": image} | _frame(cameras, index) | {"transform_matrix": transform})
     content = {"camera_model": cameras.camera_model, **frame, "frames": frames}
     with atomic_path(path) as partial:
         partial.write_text(json.dumps(content, indent=2), "utf8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +30,12 @@ class GivenCameras:
 
     def describe(self) -> str:
         """Return a text that is another one if the file is another one."""
-        return f"{self.file} (checksum {zlib.crc32(self.file.read_bytes()):08x})"
+        name = os.path.relpath(self.file, self.capture)
+        return f"{name} (checksum {zlib.crc32(self.file.read_bytes()):08x})"
+
+    def is_described_by(self, text: str) -> bool:
+        """Return whether a text is the description, in earlier versions with the path as it was typed."""
+        return text == self.describe() or text.endswith(f"/{self.describe()}")
 
     def stamp_images(self) -> dict[str, list[int]]:
         """Return a stamp of each image and mask, as `photo_stamps` does."""

@@ -111,6 +111,8 @@ class PhotosToSplat:
         with locked(self.folder, refusal, lock_seconds) as self._lock, self._workers:
             self._read_settings()  # Another run may have gone on meanwhile.
             settings = self.results.settings
+            if not self.results.has_scene():
+                settings.few = None
             if settings.views is not None and not self.results.has_scene():  # Somebody deleted it.
                 settings.views = None
                 settings.trained = None

@@ -6,6 +6,7 @@ import json
 import os
 import shlex
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ class Settings:
     run: str = "run"  # The name of the present run's folder
     views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
     files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
+    exported: dict[str, str] = field(default_factory=dict)  # Run and checkpoint of the splat in each format
     trained: str | None = None  # The sentence of a finished training
     measured: list[str] | None = None  # The sentences on how well run and file show the held-out views
     few: str | None = None  # The sentence on the registered photos, if they are few or their cameras are wrong
@@ -112,6 +114,8 @@ class SadgsFolder:
         has_run = begun.views is not None or self.checkpoint() is not None
         if begun.measure is None and has_run:  # An earlier version began it: its views stay divided as they are.
             chosen = replace(chosen, measure=None)
+        if given is not None and begun.cameras is not None and given.is_described_by(begun.cameras):
+            chosen = replace(chosen, cameras=begun.cameras)
         differences = self._differences(chosen)
         if given is not None and self.checkpoint():
             differences += given.changed_images(begun.files)
@@ -153,17 +157,22 @@ class SadgsFolder:
     def begin_another_run(self) -> str:
         """Begin a run with other options of training on the same scene, and return the sentence on it.
 
-        The splats of the present run are moved to a folder of their own first, so that they are kept also where the
-        work ends before the settings are written.
+        The splats are moved to folders named after their runs first, so that they are kept also where the work ends
+        before the settings are written.
         """
         sentence = f"Training begins anew on the same cameras ({'; '.join(self.retraining)})"
-        kept = self.path / "earlier" / self.settings.run
-        splats = [self.splat(name) for name in FORMAT_NAMES if self.splat(name).is_file()]
-        for splat in splats:
-            kept.mkdir(parents=True, exist_ok=True)
-            os.replace(splat, kept / splat.name)
-        if splats:
-            sentence += f"; the earlier splat is kept in {kept}"
+        told = ""
+        for name in FORMAT_NAMES:
+            splat = self.splat(name)
+            if splat.is_file():
+                run = self.settings.exported.get(name, self.settings.run).split("/")[0]
+                kept = self.path / "earlier" / run
+                kept.mkdir(parents=True, exist_ok=True)
+                os.replace(splat, kept / splat.name)
+                if run == self.settings.run:
+                    told = f"; the earlier splat is kept in {kept}"
+        sentence += told
+        self.settings.exported = {}
         number = int(time.time())
         while (self.runs / f"run-{number}").exists():
             number += 1
@@ -209,6 +218,32 @@ class SadgsFolder:
     def splat(self, format_name: str) -> Path:
         """Return the file of the splat in a format."""
         return self.path / f"splat.{format_name}"
+
+    def note_exports(self, format_names: Sequence[str]) -> None:
+        """Note that the splats in these formats are of the last checkpoint."""
+        for name in format_names:
+            self.settings.exported[name] = self._name_of_checkpoint()
+        self.write_settings()
+
+    def has_current_splat(self, format_name: str) -> bool:
+        """Return whether a splat is of the last checkpoint, as was noted.
+
+        Where nothing was noted, as by earlier versions, it is if it is not older than the checkpoint.
+        """
+        checkpoint = self.checkpoint()
+        splat = self.splat(format_name)
+        if checkpoint is None or not splat.is_file():
+            return False
+        noted = self.settings.exported.get(format_name)
+        if noted is not None:
+            return noted == self._name_of_checkpoint()
+        return splat.stat().st_mtime >= checkpoint.stat().st_mtime
+
+    def _name_of_checkpoint(self) -> str:
+        """Return the run and the name of its last checkpoint."""
+        checkpoint = self.checkpoint()
+        assert checkpoint is not None, "there is one after training"
+        return f"{self.settings.run}/{checkpoint.name}"
 
 
 def _shown(value: Any) -> str:

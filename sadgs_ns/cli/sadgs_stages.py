@@ -180,9 +180,10 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
     """Export the splat as `sadgs-export` does, in each format that has no file of the last checkpoint yet."""
     jobs = []
     progress = _ExportProgress(work, line)
+    stale = [name for name in work.formats if not work.results.has_current_splat(name)]
     for name in work.formats:
         output = work.results.splat(name)
-        if _is_current(work, output):
+        if name not in stale:
             progress.finished.append(f"{output}; done before")
         else:
             title = None
@@ -192,23 +193,16 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
             jobs.append(Export(work.results.run, output, data=work.data, title=title))
     for name in FORMAT_NAMES:
         output = work.results.splat(name)
-        if name not in work.formats and output.is_file() and not _is_current(work, output):
+        if name not in work.formats and output.is_file() and not work.results.has_current_splat(name):
             line.print(f"{output} is of an earlier splat: delete it, or make it anew with --formats {name}.")
     if jobs:
         line.update("starting")
         work.call(work.exporter(), line, progress.on_event, [], jobs)
+        work.results.note_exports(stale)
     *others, last = progress.finished
     for sentence in others:
         line.finish(sentence)
     return last
-
-
-def _is_current(work: PhotosToSplat, output: Path) -> bool:
-    """Return whether a file of the splat is there and not older than the last checkpoint."""
-    checkpoint = work.results.checkpoint()
-    if checkpoint is None or not output.is_file():
-        return False
-    return output.stat().st_mtime >= checkpoint.stat().st_mtime
 
 
 class _ExportProgress:

@@ -160,6 +160,7 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     known = {*read_settings(out / "work" / "settings.json", out).get("photos", [])}
     found = defaultdict(list)
     stems = defaultdict(list)
+    masks_of = defaultdict(list)
     masks = {}
     for name in files:
         kind = ""
@@ -182,11 +183,15 @@ def look_into(source: Path, out: Path) -> tuple[list[str], dict[str, str], list[
     for name in photos:
         stems[_stem(name)].append(name)
     for name in maps:
-        parts = {*name.split("/")}
-        if stems[_stem(name)]:
-            masks.setdefault(max(stems[_stem(name)], key=lambda photo: len(parts & {*photo.split("/")})), name)
-        else:
+        candidates = stems[_stem(name)]
+        if not candidates:
             found["masks of no photo"].append(name)
+            continue
+        photo = max(candidates, key=lambda photo: _fit_of_mask(name, photo))
+        masks_of[photo].append(name)
+    for photo, names in masks_of.items():
+        masks[photo] = max(names, key=lambda name: _fit_of_mask(name, photo))
+        found["further masks of a photo"] += [name for name in names if name != masks[photo]]
     own = {scene, *scene.parents}
     found["repositories or results of other work"] = [name for name in foreign if folder / name not in own]
     left = ((what, names) for what, names in found.items() if names and what not in ("photos", "masks"))
@@ -236,6 +241,18 @@ def _is_mask(path: Path, is_of_photo: bool) -> bool:
         return True
     is_extreme = (pixels < 16).all(1) | (pixels > 239).all(1)
     return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
+
+
+def _fit_of_mask(mask: str, photo: str) -> tuple[bool, int, int]:
+    """Return a key that is larger the better a mask's name fits a photo's: `masks/b.jpg.png` is that of `b.jpg`.
+
+    Where photos in several folders have one name, the mask is that of the folder that its own path names, or else of
+    the photo nearest to the top.
+    """
+    folders = photo.split("/")[:-1]
+    has_full_name = Path(mask).stem == Path(photo).name
+    common = len({*mask.split("/")[:-1]} & {*folders})
+    return has_full_name, common, -len(folders)
 
 
 def _is_swept(path: Path) -> bool:

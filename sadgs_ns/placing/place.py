@@ -91,6 +91,7 @@ def _make_scene(scene: Scene, report: Report, say: Say) -> Summary:
             shutil.rmtree(scene.work / "photos", ignore_errors=True)
         with span("conversion"):
             folder, converted = _convert(scene, folder, photos, say)
+            scene.note_masks()
         groups, alike = _group_by_camera(scene, converted)
         rigs = [[view.name for view in photo.views] for photo in photos if photo.is_panorama]
         arguments = (folder, groups, matching, scene.options.max_size, scene.model, scene.base, rigs, alike)
@@ -144,10 +145,12 @@ def _read_folder(scene: Scene, lock: contextlib.ExitStack, report: Report) -> li
     if scene.begun is not None:
         stamps = scene.begun.files
     new = [name for name in names if name not in stamps]
+    new_masks = [name for name in scene.masks.values() if name not in stamps]
+    if scene.added and not scene.has_masks:  # They are not used, and may change.
+        new_masks = []
     scene.settings.files = stamps | photo_stamps(source, new)
     lock.enter_context(scene.lock())  # Only now, when the photos are known to be readable.
-    new_masks = [name for name in scene.masks.values() if name not in stamps]
-    scene.settings.files |= photo_stamps(source, new_masks)  # They are noted when the scene is finished.
+    scene.settings.files |= photo_stamps(source, new_masks)  # They are written when the masks were read.
     return photos
 
 
@@ -203,7 +206,7 @@ def _convert(scene: Scene, folder: Path, stored: Sequence[Photo], say: Say) -> t
     masks = scene.masks
     converted, photos = convert_photos(folder, stored, scene.work / "photos")
     if scene.added:
-        has_masks = (scene.options.out / "masks").exists()
+        has_masks = scene.has_masks
     else:
         has_masks = bool(masks)
     shutil.rmtree(scene.work / "masks", ignore_errors=True)

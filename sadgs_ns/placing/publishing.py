@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,11 @@ def publish(undistorted: Path, out: Path, grown: bool) -> None:
         before = json.loads((out / "transforms.json").read_text())
         _keep_known_views(described, before)
         known = {frame["file_path"] for frame in before["frames"]}
+        # Somebody took photos out of transforms.json, whose images are there: they stay out.
+        described["frames"] = [
+            frame for frame in described["frames"] if not _is_taken_out(frame["file_path"], known, undistorted, out)
+        ]
+        images = [frame["file_path"] for frame in described["frames"]]
         images = [name for name in images if (undistorted / name).exists() or name not in known]
     file.write_text(json.dumps(described, indent=4))
     written = images + masks
@@ -42,6 +48,11 @@ def publish(undistorted: Path, out: Path, grown: bool) -> None:
     if not grown:
         _remove_scene(out)
     _move(undistorted, out, written)
+
+
+def _is_taken_out(name: str, known: Collection[str], undistorted: Path, out: Path) -> bool:
+    """Return whether an image of the scene was taken out of its transforms.json, and is not undistorted anew."""
+    return name not in known and not (undistorted / name).exists() and (out / name).exists()
 
 
 def _keep_known_views(described: dict[str, Any], before: dict[str, Any]) -> None:

@@ -30,6 +30,8 @@ class SceneSettings:
     frames: int | None = None  # None for photos
     files: dict[str, list[int]] = dataclasses.field(default_factory=dict)
     """Stamps, by `photo_stamps`, of the photos and masks, or videos."""
+    has_noted_masks: bool = False
+    """Whether `files` has the masks, too, in which features lie that were found; a finished scene always has them."""
     bit_depth: int | None = None
     """Bits that the values of photos of 16 bits use; None until there are such, or if an earlier version began it."""
     max_size: int | None = None  # None until the scene is finished, because until then it may change
@@ -88,6 +90,11 @@ class Scene:
             if self.finished:
                 self._find_model(self.begun)
 
+    @property
+    def has_masks(self) -> bool:
+        """Whether the scene's images have masks."""
+        return (self.options.out / "masks").exists()
+
     def _check_folder(self) -> None:
         """Raise InputError if the folder holds files and is no scene."""
         out = self.options.out
@@ -104,7 +111,14 @@ class Scene:
         if begun.source != self.settings.source:  # With another source all the rest differs, too.
             differences = [f"source was {begun.source}, is {self.settings.source}"]
         else:
-            kind = "videos" if self.is_video else "photos"
+            kind = "photos"
+            if self.is_video:
+                kind = "videos"
+            elif begun.frames is not None:
+                problem = f"{self.options.out} was begun with videos, beside which there are photos now"
+                raise InputError(f"{problem}: move the photos to a folder of their own.")
+            elif self.masks:
+                kind = "photos or masks"
             changes = self._changed_files(begun)
             differences = [f"{kind} {change}" for change in changes.values()]
             differences += self._changed_options(begun)
@@ -117,14 +131,15 @@ class Scene:
     def _changed_files(self, begun: SceneSettings) -> dict[str, str]:
         """Return the changes of photos and masks, or videos, as `changes_of` does."""
         source = self.options.source
-        files = self.settings.photos
         if source.is_file():
-            files = [""]
-        elif self.finished and not self.is_video:  # Others may be added, with their masks.
-            photos = [name for name in files if name in begun.photos]
+            return changes_of(source, begun.files, [""])
+        photos = self.settings.photos
+        if self.finished and not self.is_video:  # Others may be added, with their masks.
+            photos = [name for name in photos if name in begun.photos]
+        masks = []
+        if self.finished or begun.has_noted_masks:
             masks = [self.masks[name] for name in photos if name in self.masks]
-            files = photos + masks
-        return changes_of(source, begun.files, files)
+        return changes_of(source, begun.files, photos + masks)
 
     def _changed_options(self, begun: SceneSettings) -> list[str]:
         """Return the options that differ, as parts of a sentence."""
@@ -161,6 +176,12 @@ class Scene:
                 for name in _UNFINISHED:
                     shutil.rmtree(self.work / name, ignore_errors=True)
                 (self.work / "pairs.txt").unlink(missing_ok=True)
+
+    def note_masks(self) -> None:
+        """Write, before features are found, that they are found in the present masks."""
+        if self.finished is None:
+            self.settings.has_noted_masks = True
+            self.settings.write(self._settings_file)
 
     def finish(self, summary: Summary) -> None:
         """Write that the scene is finished, and remove the files that are not needed to add photos to it."""

@@ -26,6 +26,7 @@ from sadgs_ns.cli import sadgs
 from sadgs_ns.cli.added_photos import choose_run
 from sadgs_ns.cli.photos_to_splat import PhotosToSplat
 from sadgs_ns.cli.sadgs import main
+from sadgs_ns.cli.sadgs_folder import SadgsFolder
 from sadgs_ns.cli.sadgs_options import Sadgs
 from sadgs_ns.cli.status_line import StatusLine
 from sadgs_ns.data.ply import read_points
@@ -684,8 +685,9 @@ def test_files_of_an_earlier_splat_are_told(
     assert status == 0
     printed = capsys.readouterr().out
     assert "is of an earlier splat" not in printed
-    for path in (out / "splat.spz", out / "splat.ply"):
-        os.utime(path, (0, 0))
+    (checkpoint,) = (out / "training/sadgs/run/nerfstudio_models").iterdir()
+    later = checkpoint.rename(checkpoint.with_name("step-000000099.ckpt"))
+    os.utime(later, (0, 0))  # As in a copy of the folder, times tell nothing.
     status = main([*command, "ply"])
     assert status == 0
     status = main([*command, "ply"])
@@ -695,6 +697,43 @@ def test_files_of_an_earlier_splat_are_told(
     assert printed.count(told) == 2
     assert commands[-1][0] == "sadgs-export"
     assert len(commands) == 4
+
+
+@pytest.mark.hard_case(
+    "a splat of an earlier run in another format, and another effort", "each is kept in the folder of its own run"
+)
+def test_splats_of_different_runs_are_kept_apart(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    for number, run in enumerate(("run", "run-16")):
+        folder.settings.run = run
+        checkpoints = folder.run / "nerfstudio_models"
+        checkpoints.mkdir(parents=True)
+        (checkpoints / "step-000000007.ckpt").touch()
+        for name in ("ply", "sog")[number:]:
+            folder.splat(name).write_text(f"{name} of {run}")
+        folder.note_exports(("ply", "sog")[number:])
+    assert not folder.has_current_splat("ply")
+    assert folder.has_current_splat("sog")
+    told = folder.begin_another_run()
+    assert told.endswith("; the earlier splat is kept in " + str(tmp_path / "earlier/run-16") + ".")
+    assert (tmp_path / "earlier/run-16/splat.sog").read_text() == "sog of run-16"
+    assert (tmp_path / "earlier/run/splat.ply").read_text() == "ply of run"
+
+
+@pytest.mark.hard_case(
+    "the scene of `sadgs` was deleted after few photos had registered, and `--anyway` is given",
+    "cameras are found again",
+)
+def test_few_photos_of_a_scene_that_was_deleted_are_forgotten(photos: Path, tmp_path: Path, commands: list[list[str]]):
+    out = tmp_path / "out"
+    command = [str(photos), "-o", str(out), "--formats", "ply"]
+    assert main(command) == 0
+    settings = read_json(out / "settings.json")
+    write_json(out / "settings.json", settings | {"few": "3 of 20 photos registered"})
+    shutil.rmtree(out / "scene")
+    commands.clear()
+    assert main([*command, "--anyway"]) == 0
+    assert commands[0][0] == "sadgs-process"
 
 
 def test_a_run_is_not_that_of_cameras_that_were_found_after_it(
@@ -764,6 +803,14 @@ def test_cameras_that_a_folder_brings_are_used(
     assert len(commands) == 2
     expected = {path: path.stat().st_mtime_ns for path in capture.folder.rglob("*")}
     assert before == expected
+    link = tmp_path / "link"
+    link.symlink_to(capture.folder)
+    typed_otherwise = link
+    if capture.given.is_file():
+        typed_otherwise = link / capture.given.name
+    status = main([str(typed_otherwise) if word == str(capture.given) else word for word in command])
+    assert status == 0, "the same folder by another path is no other capture"
+    assert len(commands) == 2
     status = main([*command, "--max-size", "800"])
     assert status == 2
     told = f"--max-size is for new cameras, and those of {capture.cameras} are used: leave it out, or for"
@@ -814,7 +861,8 @@ def test_other_or_empty_cameras_in_a_folder_are_refused(
     capture.cameras.write_bytes(capture.cameras.read_bytes() + b" ")
     assert main(command) == 2
     errors = capsys.readouterr().err
-    assert f"(--cameras was {capture.cameras} (checksum " in errors
+    name = capture.cameras.relative_to(capture.folder)
+    assert f"(--cameras was {name} (checksum " in errors
     capture.cameras.write_bytes(b"")
     other = tmp_path / "other"
     status = main(capture.command(other))

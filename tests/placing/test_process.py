@@ -2003,16 +2003,94 @@ def test_other_masks_make_another_scene(tmp_path: Path, registered: Callable[[in
     capsys.readouterr()
     assert main(command) == 2
     errors = capsys.readouterr().err
-    assert "(photos changed: 1, such as masks/a.png); put these photos back, give another" in errors
+    assert "(photos or masks changed: 1, such as masks/a.png); put these photos or masks back, give another" in errors
     mask.rename(mask.with_name("b.png"))
     assert main(command) == 2
-    changes = "photos added: 1, such as masks/b.png; photos removed: 1, such as masks/a.png"
+    changes = "photos or masks added: 1, such as masks/b.png; photos or masks removed: 1, such as masks/a.png"
     errors = capsys.readouterr().err
-    assert f"({changes}); put these photos back, give another" in errors
+    assert f"({changes}); put these photos or masks back, give another" in errors
     mask.with_name("b.png").unlink()
     mask.write_bytes(content)
     black(photos, "d.png", "masks/d.png")
     assert Scene(Process(photos, tmp_path / "out")).added == 1
+
+
+@pytest.mark.hard_case(
+    "masks changed before the cameras are found, after features were", "refused, because features lie in the old masks"
+)
+def test_masks_of_an_unfinished_scene_stay(tmp_path: Path, taken: list[list[str]], capsys):
+    photos = black(tmp_path / "photos", "a.png", "b.png", "c.png", "masks/a.png")
+    command = [str(photos), str(tmp_path / "out")]
+    assert main(command) == 130
+    assert main(command) == 130
+    capsys.readouterr()
+    black(photos, "masks/b.png")
+    assert main(command) == 2
+    told = "(photos or masks added: 1, such as masks/b.png); give another folder or delete it."
+    assert told in capsys.readouterr().err
+    assert len(taken) == 2
+
+
+@pytest.mark.hard_case(
+    "an added photo's mask, in a scene without masks, is taken away again", "goes on: it was not used"
+)
+def test_a_mask_that_was_not_used_may_go(grown: tuple[Path, Path, dict[str, Any]], capsys):
+    source, out, _ = grown
+    mask = source / "09_mask.png"
+    Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
+    command = [str(source), str(out), "--max-size", "120"]
+    assert main(command) == 0
+    assert "not used, because the scene has none" in capsys.readouterr().out
+    mask.unlink()
+    assert main(command) == 0
+
+
+@pytest.mark.hard_case("photos put beside the videos of a scene", "refused: move them to a folder of their own")
+def test_photos_beside_the_videos_of_a_scene_are_told(tmp_path: Path, taken: list[list[str]], capsys):
+    source = tmp_path / "videos"
+    source.mkdir()
+    film(source / "film.avi", 6)
+    command = [str(source), str(tmp_path / "out"), "--frames", "6"]
+    assert main(command) == 130
+    black(source, "a.png", "b.png", "c.png")
+    assert main(command) == 2
+    told = "was begun with videos, beside which there are photos now: move the photos to a folder of their own."
+    assert told in capsys.readouterr().err
+
+
+@pytest.mark.hard_case(
+    "photos in several folders have equal names, and masks are for some", "each mask is that of the photo it names"
+)
+def test_masks_belong_to_the_photos_that_their_paths_name(tmp_path: Path):
+    views = [photo.filter(ImageFilter.GaussianBlur(3)) for photo in itertools.islice(draw_photos(), 5)]
+    names = ["IMG_1.jpg", "100CANON/IMG_1.jpg", "a.jpg", "a.png", "b/img5.jpg"]
+    for name, view in zip(names, views, strict=True):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        view.rotate(90 * (name == "a.png")).save(tmp_path / name)
+    expected = {
+        "IMG_1.jpg": "masks/IMG_1.png", "100CANON/IMG_1.jpg": "masks/100CANON/IMG_1.png", "a.jpg": "masks/a.jpg.png",
+        "a.png": "masks/a.png.png", "b/img5.jpg": "b/img5_mask.png",
+    }  # fmt: skip
+    for name in [*expected.values(), "masks/img5.png"]:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / name)
+    photos, masks, told = look_into(tmp_path, tmp_path / "out")
+    assert photos == sorted(names)
+    assert masks == expected
+    assert told == ["Left out as further masks of a photo: 1, such as masks/img5.png."]
+
+
+@pytest.mark.hard_case(
+    "photos added to a scene of whose `transforms.json` a photo was taken out", "they are added, and it stays out"
+)
+def test_a_photo_that_was_taken_out_stays_out_where_others_are_added(grown: tuple[Path, Path, dict[str, Any]]):
+    source, out, before = grown
+    gone = before["frames"].pop()["file_path"]
+    write_json(out / "transforms.json", before)
+    assert process(Process(source, out, max_size=120)).registered == VIEWS
+    names = {frame["file_path"] for frame in read_json(out / "transforms.json")["frames"]}
+    assert gone not in names
+    assert len(names) == VIEWS - 1
 
 
 @pytest.mark.hard_case(
