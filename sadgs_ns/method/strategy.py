@@ -27,7 +27,7 @@ class StructureAwareStrategy(Strategy):
     """
 
     max_gaussians: int = 4_000_000
-    """Hard cap on the number of Gaussians, never exceeded.
+    """Hard cap on the number of Gaussians, never exceeded; of a resumed run with more, none is taken away.
     A run that would outgrow it lets those grow first that need it most, and fills it when densification ends.
     On CUDA fewer are added, with a warning, if the device's memory cannot hold more."""
     structure_every: int | None = None

@@ -193,6 +193,9 @@ def _plan_strategy(
         ):
             cap = before.strategy.max_gaussians
             note(f"At most {cap:,} Gaussians, as in the checkpoint's run.")
+    num_gaussians = pipeline.model.num_gaussians
+    if before is not None and num_gaussians > cap:
+        warn(f"The checkpoint has {num_gaussians:,} Gaussians, more than the {cap:,} allowed: none is taken away.")
     factor = growth_threshold(options.effort, len(pipeline.datamanager.train_dataset))
     if dense:
         factor *= DENSE_THRESHOLDS

@@ -866,6 +866,23 @@ def test_a_resumption_keeps_the_cap_where_memory_has_room_for_it(
     assert said or "checkpoint's run" not in printed
 
 
+def test_a_resumption_with_more_gaussians_than_the_cap_says_that_they_stay(
+    config: SadgsTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    trainer = set_up(config)
+    trainer.save_checkpoint(1)
+    count = trainer.pipeline.model.num_points
+    config.load_dir = trainer.checkpoint_dir
+    config.output_dir = tmp_path / "resumed"
+    config.pipeline.model.strategy.max_gaussians = count - 1
+    capsys.readouterr()
+    assert set_up(config).pipeline.model.num_points == count
+    printed = " ".join(capsys.readouterr().out.split())
+    assert (
+        f"The checkpoint has {count:,} Gaussians, more than the {count - 1:,} allowed: none is taken away." in printed
+    )
+
+
 # --- damaged checkpoints ---
 
 
