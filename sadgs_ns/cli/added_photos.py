@@ -14,11 +14,11 @@ from sadgs_ns.files import write_json
 
 
 def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
-    """Divide the views of a scene that is new or has grown, and begin another run if one began with fewer views.
+    """Divide the views of a scene that is new or has changed, and begin another run if one began with other views.
 
     Nothing changes if the present run began with these views. Options that divide them are left to do it. Of a scene
-    that has grown the frame and the held-out views of the last run stay, also if the present run has other options and
-    has saved nothing yet.
+    that has changed the frame and the held-out views of the last run stay, also if the present run has other options
+    and has saved nothing yet.
     """
     settings = folder.settings
     views = folder.views()
@@ -31,20 +31,21 @@ def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
     described = json.loads(file.read_bytes())
     has_frame = FRAME_KEYS[0] in described
     has_earlier = last_run is not None or has_frame
-    has_grown = bool(before) and views != before
-    if has_grown and last_run is not None and not has_frame:
+    has_changed = bool(before) and views != before
+    if has_changed and last_run is not None and not has_frame:
         _keep_frame(last_run, described)
     if not divides(train_options):
         if settings.measure is None:
             if before and has_earlier:
-                described |= divide_additions(described, [before, views])
+                still_there = [view for view in before if view in views]
+                described |= divide_additions(described, [still_there, views])
         elif before and has_earlier:
             described |= divide(views, settings.measure, before, described.get("test_filenames", []))
         else:
             described |= divide(views, settings.measure)
     write_json(file, described)
     if before and has_checkpoint:
-        settings.run = f"run-{len(views)}"
+        settings.run = folder.new_run_name(len(views))
         settings.trained = None
         settings.measured = None
     settings.views = views

@@ -124,11 +124,16 @@ def export(options: Export) -> int:
         from sadgs_ns.data.run_cameras import read_cameras
 
         cameras = read_cameras(folder, options.data)
+    pipeline: dict[str, Any] = {}
+    if cameras is not None and options.cameras is not None:
+        from sadgs_ns.cli.exported_cameras import check_images
+
+        _, pipeline = _load(options.run)
+        check_images(pipeline, cameras)
     params = _cleaned(params, cleaning, cameras, drawing)
     if cameras is not None and options.cameras is not None:
         from sadgs_ns.cli.exported_cameras import write_cameras
 
-        _, pipeline = _load(options.run)
         write_cameras(options.cameras, pipeline, cameras, similarity)
     if is_mesh and cameras is not None:
         from sadgs_ns.cli.meshing import write_mesh

@@ -27,10 +27,10 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 def write_cameras(path: Path, pipeline: Mapping[str, Any], cameras: RunCameras, similarity: Similarity | None) -> None:
     """Write the training cameras of a checkpoint's pipeline, and print whether it refined them.
 
-    `cameras` are those of the capture, and the similarity maps the run's frame to the file's. Raises InputError if the
-    capture's views are not those of the checkpoint, WriteError if writing fails.
+    `cameras` are those of the capture, and the similarity maps the run's frame to the file's. Call
+    `check_images` before. Raises InputError if the cameras are of a type that cannot be written, WriteError if writing
+    fails.
     """
-    _check_images(pipeline, cameras)
     if cameras.distortion is not None and cameras.distortion.shape[1] > len(_COEFFICIENTS):
         raise InputError("--cameras cannot write cameras of the type FISHEYE624: leave it out.")
     poses = cameras.camera_to_worlds
@@ -46,13 +46,22 @@ def write_cameras(path: Path, pipeline: Mapping[str, Any], cameras: RunCameras, 
         poses = torch.from_numpy(similarity.poses(poses.double().numpy()))
     frames = []
     for index, pose in enumerate(poses.tolist()):
-        image = os.path.relpath(cameras.images[index].absolute(), path.absolute().parent)
+        image = _name_from(path.parent, cameras.images[index])
         transform = [*pose, [0.0, 0.0, 0.0, 1.0]]
         frames.append({"file_path": image} | _frame(cameras, index) | {"transform_matrix": transform})
     content = {"camera_model": cameras.camera_model, **frame, "frames": frames}
     with atomic_path(path) as partial:
         partial.write_text(json.dumps(content, indent=2), "utf8")
     print(f"{path}: {len(frames)} training cameras, {origin}")
+
+
+def _name_from(folder: Path, image: Path) -> str:
+    """Return the path of an image from a folder that it lies in or below, or else the absolute one."""
+    real = Path(os.path.realpath(image.parent)) / image.name
+    root = Path(os.path.realpath(folder))
+    if real.is_relative_to(root):
+        return real.relative_to(root).as_posix()
+    return str(real)
 
 
 def refined(
@@ -66,7 +75,7 @@ def refined(
     return refined_to_worlds * flip
 
 
-def _check_images(pipeline: Mapping[str, Any], cameras: RunCameras) -> None:
+def check_images(pipeline: Mapping[str, Any], cameras: RunCameras) -> None:
     """Raise InputError if the capture's training images are not those of the checkpoint."""
     before = pipeline.get("_extra_state", {}).get("images")
     now = [path.name for path in cameras.images]

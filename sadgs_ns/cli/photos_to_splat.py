@@ -117,7 +117,8 @@ class PhotosToSplat:
                 settings.views = None
                 settings.trained = None
                 settings.measured = None
-                settings.run = f"run-{int(time.time())}"
+                settings.run = self.results.new_run_name(int(time.time()))
+                settings.previous_run = None
             elif self.results.retraining:
                 self.console.print(self.results.begin_another_run(), markup=False, soft_wrap=True)
             self.results.write_settings()

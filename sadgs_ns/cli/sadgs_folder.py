@@ -6,7 +6,6 @@ import json
 import os
 import shlex
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from sadgs_ns.cli.sadgs_options import FORMAT_NAMES
 from sadgs_ns.errors import InputError
 from sadgs_ns.files import read_settings, write_json
 
+_CHECKPOINTS = "nerfstudio_models/step-*.ckpt"  # In a run's folder
 _OPTION_NAMES = {
     "source": "source",
     "cameras": "--cameras",
@@ -42,6 +42,7 @@ class Settings:
 
     # How far the work is
     run: str = "run"  # The name of the present run's folder
+    previous_run: str | None = None  # That of the run with other options on the same scene, which it follows
     views: list[str] | None = None  # The images of the scene for which the run was begun, in nerfstudio's order
     files: dict[str, list[int]] = field(default_factory=dict)  # Stamps of the images of given cameras
     exported: dict[str, str] = field(default_factory=dict)  # Run and checkpoint of the splat in each format
@@ -154,6 +155,12 @@ class SadgsFolder:
                 differences.append(f"{_OPTION_NAMES[name]} was {_shown(before)}, is {_shown(now)}")
         return differences
 
+    def new_run_name(self, number: int) -> str:
+        """Return a name for another run's folder, with this number or a larger one."""
+        while (self.runs / f"run-{number}").exists():
+            number += 1
+        return f"run-{number}"
+
     def begin_another_run(self) -> str:
         """Begin a run with other options of training on the same scene, and return the sentence on it.
 
@@ -161,7 +168,7 @@ class SadgsFolder:
         before the settings are written.
         """
         sentence = f"Training begins anew on the same cameras ({'; '.join(self.retraining)})"
-        told = ""
+        moved_to = []
         for name in FORMAT_NAMES:
             splat = self.splat(name)
             if splat.is_file():
@@ -169,14 +176,13 @@ class SadgsFolder:
                 kept = self.path / "earlier" / run
                 kept.mkdir(parents=True, exist_ok=True)
                 os.replace(splat, kept / splat.name)
-                if run == self.settings.run:
-                    told = f"; the earlier splat is kept in {kept}"
-        sentence += told
+                if kept not in moved_to:
+                    moved_to.append(kept)
+        if moved_to:
+            sentence += f"; the earlier splat is kept in {' and '.join(map(str, moved_to))}"
         self.settings.exported = {}
-        number = int(time.time())
-        while (self.runs / f"run-{number}").exists():
-            number += 1
-        self.settings.run = f"run-{number}"
+        self.settings.previous_run = self.settings.run
+        self.settings.run = self.new_run_name(int(time.time()))
         self.settings.trained = None
         self.settings.measured = None
         self.retraining = []
@@ -197,17 +203,14 @@ class SadgsFolder:
 
     def checkpoint(self) -> Path | None:
         """Return the last checkpoint of the present run."""
-        return max(self.run.glob("nerfstudio_models/step-*.ckpt"), default=None)
+        return max(self.run.glob(_CHECKPOINTS), default=None)
 
     def last_run(self) -> Path | None:
-        """Return the folder of the last run that saved a checkpoint, which is the present run if that did."""
-        if self.checkpoint() is not None:
-            return self.run
-        checkpoints = self.runs.glob("run*/nerfstudio_models/step-*.ckpt")
-        last = max(checkpoints, key=lambda file: file.stat().st_mtime, default=None)
-        if last is None:
-            return None
-        return last.parents[1]
+        """Return the folder of the last run on this scene that saved a checkpoint, the present run's if it did."""
+        for name in (self.settings.run, self.settings.previous_run):
+            if name is not None and any((self.runs / name).glob(_CHECKPOINTS)):
+                return self.runs / name
+        return None
 
     def trained(self) -> str | None:
         """Return the sentence of a finished training, None if there is none or its checkpoint was deleted."""
@@ -219,10 +222,9 @@ class SadgsFolder:
         """Return the file of the splat in a format."""
         return self.path / f"splat.{format_name}"
 
-    def note_exports(self, format_names: Sequence[str]) -> None:
-        """Note that the splats in these formats are of the last checkpoint."""
-        for name in format_names:
-            self.settings.exported[name] = self._name_of_checkpoint()
+    def note_export(self, format_name: str) -> None:
+        """Note that the splat in a format is of the last checkpoint."""
+        self.settings.exported[format_name] = self._name_of_checkpoint()
         self.write_settings()
 
     def has_current_splat(self, format_name: str) -> bool:

@@ -118,6 +118,7 @@ def train(work: PhotosToSplat, line: StatusLine) -> str:
         line.update("going on")
     else:
         line.update("starting")
+        results.settings.exported = {}
         if work.given is not None:
             results.settings.files = work.given.stamp_images()
     results.write_settings()
@@ -198,7 +199,6 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
     if jobs:
         line.update("starting")
         work.call(work.exporter(), line, progress.on_event, [], jobs)
-        work.results.note_exports(stale)
     *others, last = progress.finished
     for sentence in others:
         line.finish(sentence)
@@ -220,6 +220,7 @@ class _ExportProgress:
             self._line.update(output)
             self._work.timeline.begin("export", Path(output).name.removeprefix("splat."))
         elif event == "export ends":
+            self._work.results.note_export(Path(output).name.removeprefix("splat."))
             megabytes = Path(output).stat().st_size / 1e6
             self.finished.append(f"{output}, {megabytes:,.1f} MB")
 

@@ -51,9 +51,8 @@ def install() -> None:
             for name in ("package.json", "package-lock.json"):
                 shutil.copyfile(PACKAGES / name, work / name)
             _run("npm ci", [*npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"], work)
-            work.chmod(
-                0o755
-            )  # Others may use it, too, where the cache is in an image or shared: mkdtemp allows no one.
+            # mkdtemp allows no other user, but the cache may be shared or in an image.
+            work.chmod(0o755)
             work.rename(target)
         finally:
             shutil.rmtree(work, ignore_errors=True)

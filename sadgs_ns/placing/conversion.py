@@ -140,8 +140,8 @@ def write_masks(
 ) -> int:
     """Write a mask for each photo `NAME` as it was `converted`, `NAME.png` in `target`, a white one if it has none.
 
-    Return how many of them hide something. Raise InputError if a mask has another shape than its photo, or transparent
-    parts.
+    Return how many of them hide something. Raise InputError if a mask has another shape than its photo, or white parts
+    that are transparent.
     """
     num_hiding = 0
     names = iter(f"{photo.name}.png" for photo in converted)
@@ -164,15 +164,18 @@ def write_masks(
 def _read_mask(file: Path, photo: Photo, photo_file: Path) -> Image.Image:
     """Read a mask, upright and in the photo's size, in black and white.
 
-    Raise InputError if it has another shape, or transparent parts, which may mean either of the two.
+    Raise InputError if it has another shape, or white parts that are transparent, which may mean either of the two.
     """
     with Image.open(file) as image:
+        is_transparent = False
         if image.has_transparency_data:
             image = image.convert("RGBA")
-            if image.getchannel("A").getextrema() != (255, 255):
-                problem = f"{file} is a mask with transparent parts"
-                raise InputError(f"{problem}: save it without transparency, black where {photo.name} is to be hidden.")
-        mask = Image.fromarray(np.uint8(255 * valid_pixels(image)))
+            is_transparent = np.asarray(image.getchannel("A")) < 128
+        is_valid = valid_pixels(image)
+        if (is_valid & is_transparent).any():
+            problem = f"{file} is a mask whose white has transparent parts"
+            raise InputError(f"{problem}: save it without transparency, black where {photo.name} is to be hidden.")
+        mask = Image.fromarray(np.uint8(255 * is_valid))
     width, height = photo.size
     lies_on_side = (mask.width > mask.height) != (width > height)
     if photo.is_turned and lies_on_side:  # It was made of the photo as that is stored.

@@ -243,16 +243,22 @@ def _is_mask(path: Path, is_of_photo: bool) -> bool:
     return bool(is_extreme.mean() > 0.95 or len(np.unique(pixels, axis=0)) < 3)
 
 
-def _fit_of_mask(mask: str, photo: str) -> tuple[bool, int, int]:
-    """Return a key that is larger the better a mask's name fits a photo's: `masks/b.jpg.png` is that of `b.jpg`.
+def _fit_of_mask(mask: str, photo: str) -> tuple[int, int, bool, int]:
+    """Return a key that is larger the better a mask's path fits a photo's.
 
     Where photos in several folders have one name, the mask is that of the folder that its own path names, or else of
-    the photo nearest to the top.
+    the photo nearest to the top. In one folder `b.jpg.png` is the mask of `b.jpg`, and not that of `b.png`.
     """
     folders = photo.split("/")[:-1]
+    mask_folders = [folder for folder in mask.split("/")[:-1] if not _MASK.fullmatch(f"{folder}/")]
+    equal_at_end = 0
+    for folder, mask_folder in zip(reversed(folders), reversed(mask_folders), strict=False):
+        if folder != mask_folder:
+            break
+        equal_at_end += 1
+    equal = len({*folders} & {*mask_folders})
     has_full_name = Path(mask).stem == Path(photo).name
-    common = len({*mask.split("/")[:-1]} & {*folders})
-    return has_full_name, common, -len(folders)
+    return equal_at_end, equal, has_full_name, -len(folders)
 
 
 def _is_swept(path: Path) -> bool:

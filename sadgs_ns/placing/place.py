@@ -146,8 +146,6 @@ def _read_folder(scene: Scene, lock: contextlib.ExitStack, report: Report) -> li
         stamps = scene.begun.files
     new = [name for name in names if name not in stamps]
     new_masks = [name for name in scene.masks.values() if name not in stamps]
-    if scene.added and not scene.has_masks:  # They are not used, and may change.
-        new_masks = []
     scene.settings.files = stamps | photo_stamps(source, new)
     lock.enter_context(scene.lock())  # Only now, when the photos are known to be readable.
     scene.settings.files |= photo_stamps(source, new_masks)  # They are written when the masks were read.

@@ -13,7 +13,8 @@ from sadgs_ns.errors import InputError, WriteError
 from sadgs_ns.placing.conversion import restore_alpha
 from sadgs_ns.placing.photos import read_photos
 
-_KEPT_KEYS = (*FRAME_KEYS, "train_filenames", "val_filenames", "test_filenames")  # Kept when photos are added
+_LISTS = {"train_filenames", "val_filenames", "test_filenames"}
+_KEPT_KEYS = (*FRAME_KEYS, *sorted(_LISTS))  # Kept when photos are added
 
 
 def publish(undistorted: Path, out: Path, grown: bool) -> None:
@@ -37,6 +38,8 @@ def publish(undistorted: Path, out: Path, grown: bool) -> None:
             frame for frame in described["frames"] if not _is_taken_out(frame["file_path"], known, undistorted, out)
         ]
         images = [frame["file_path"] for frame in described["frames"]]
+        for key in _LISTS & described.keys():
+            described[key] = [name for name in described[key] if name in images]
         images = [name for name in images if (undistorted / name).exists() or name not in known]
     file.write_text(json.dumps(described, indent=4))
     written = images + masks

@@ -139,7 +139,12 @@ class Scene:
         masks = []
         if self.finished or begun.has_noted_masks:
             masks = [self.masks[name] for name in photos if name in self.masks]
-        return changes_of(source, begun.files, photos + masks)
+        stamps = begun.files
+        if (
+            self.finished and not self.is_video and not self.has_masks
+        ):  # Masks of added photos were not used: they may go.
+            stamps = {name: stamp for name, stamp in stamps.items() if name in begun.photos or name in masks}
+        return changes_of(source, stamps, photos + masks)
 
     def _changed_options(self, begun: SceneSettings) -> list[str]:
         """Return the options that differ, as parts of a sentence."""
@@ -187,6 +192,7 @@ class Scene:
         """Write that the scene is finished, and remove the files that are not needed to add photos to it."""
         self.settings.max_size = self.options.max_size
         self.settings.finished = dataclasses.asdict(summary)
+        self.settings.has_noted_masks = True
         self.settings.model = self.model.name
         self.settings.write(self._settings_file)
         self.remove_intermediate_files()

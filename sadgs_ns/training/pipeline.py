@@ -31,7 +31,7 @@ from sadgs_ns.render.types import Cameras as Pinholes
 from sadgs_ns.training.config import SadgsPipelineConfig
 from sadgs_ns.training.datamanager import SadgsDatamanager
 from sadgs_ns.training.model import NORMALS, SadgsModel
-from sadgs_ns.training.photo_names import photo_names
+from sadgs_ns.training.photo_names import photo_names, same_photos
 from sadgs_ns.training.run.checkpoints import check_number_of_views, check_order_of_views
 from sadgs_ns.training.run.memory_plan import choose_image_storage
 from sadgs_ns.training.run.moved_search import MovedSearch
@@ -395,6 +395,7 @@ class SadgsPipeline(VanillaPipeline):
         }
         if len(self.views.moved):
             state["moved"] = self.views.moved.state_dict(self._photo_names)
+            state["photo_names"] = self._photo_names
         if self.device.type == "cuda":
             state["cuda"] = torch.cuda.get_rng_state(self.device)
         return state
@@ -419,9 +420,26 @@ class SadgsPipeline(VanillaPipeline):
         moved = state.get("moved", {})
         if not self.config.find_moved:
             moved = {}
-        self.views.moved.load_state_dict(moved, self._photo_names, self.device)
+        names = []
+        if moved:
+            names = self._names_in(state)
+        self.views.moved.load_state_dict(moved, names, self.device)
         if "cuda" in state and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"].cpu(), self.device)
+
+    def _names_in(self, state: Mapping[str, Any]) -> list[str]:
+        """Return the names that a checkpoint's state has for the present training photos, "" for those it lacks."""
+        names = self._photo_names
+        before = state.get("photo_names")
+        if before is None:  # Earlier versions did not note them.
+            return names
+        known = []
+        for row in same_photos(before, names):
+            name = ""
+            if row is not None:
+                name = before[row]
+            known.append(name)
+        return known
 
 
 def _check_data_of_run(config: SadgsPipelineConfig) -> None:

@@ -114,6 +114,41 @@ def test_held_out_views_and_frame_stay_when_photos_and_options_change_at_once(tm
     assert (tmp_path / "earlier/run/splat.ply").is_file()
 
 
+@pytest.mark.hard_case(
+    "photos are added to a folder of `sadgs` whose scene was deleted and found anew before",
+    "the frame of the deleted scene is not kept",
+)
+def test_the_frame_of_a_scene_that_was_deleted_is_not_kept(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    checkpoints = folder.run / "nerfstudio_models"
+    checkpoints.mkdir(parents=True)
+    (checkpoints / "step-000000007.ckpt").touch()
+    write_json(folder.run / "dataparser_transforms.json", {"transform": [[1, 0, 0, 2]], "scale": 0.5})
+    folder.settings.run = folder.new_run_name(5)  # As after somebody deleted the scene; it has saved nothing yet.
+    folder.settings.measure = False
+    write_scene(folder, VIEWS[:10])
+    choose_run(folder, [])
+    write_scene(folder, VIEWS)
+    choose_run(folder, [])
+    assert "dataparser_transform" not in read_json(folder.scene / "transforms.json")
+
+
+def test_a_run_with_as_many_views_as_an_earlier_one_has_a_folder_of_its_own(tmp_path: Path):
+    folder = SadgsFolder(tmp_path)
+    folder.settings.measure = False
+    moved = {"transform": [[1, 0, 0, 2]], "scale": 0.5}
+    runs = []
+    for views in (VIEWS[:10], VIEWS[1:11], VIEWS[2:12]):  # One is taken out, and another one added.
+        write_scene(folder, views)
+        choose_run(folder, [])
+        checkpoints = folder.run / "nerfstudio_models"
+        checkpoints.mkdir(parents=True)
+        (checkpoints / "step-000000007.ckpt").touch()
+        write_json(folder.run / "dataparser_transforms.json", moved)
+        runs.append(folder.run.name)
+    assert runs == ["run", "run-10", "run-11"]
+
+
 def test_another_run_on_the_same_views_divides_them_alike_and_finds_its_own_frame(tmp_path: Path):
     folder = SadgsFolder(tmp_path)
     write_scene(folder, VIEWS)

@@ -55,7 +55,7 @@ def test_refined_cameras_are_written_in_either_frame(scene: Path, tmp_path: Path
     files = trainer.pipeline.datamanager.train_dataset.image_filenames
     actual = [frame["file_path"] for frame in content["frames"]]
     assert [(file.parent / name).resolve() for name in actual] == [path.resolve() for path in files]
-    assert not any(Path(name).is_absolute() for name in actual), "so that it holds also for a run on a relative folder"
+    assert all(Path(name).is_absolute() for name in actual), "the images do not lie beside the file"
 
     arguments = ["--output", str(tmp_path / "splat.ply"), "--cameras", str(file), "--frame", "colmap"]
     status = export.main([str(run), *arguments])

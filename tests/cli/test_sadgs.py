@@ -572,8 +572,9 @@ def test_training_is_not_done_before_if_its_folder_was_deleted(
         patch.setattr(PhotosToSplat, "call", interrupted)
         assert main(arguments) == 130
     commands.clear()
+    os.utime(tmp_path / "out/splat.ply", (0, 0))
     assert main(arguments) == 0
-    assert commands[0][0] == "ns-train"
+    assert [words[0] for words in commands] == ["ns-train", "sadgs-export"], "the splat is of the deleted run"
 
 
 @pytest.mark.hard_case(
@@ -711,11 +712,12 @@ def test_splats_of_different_runs_are_kept_apart(tmp_path: Path):
         (checkpoints / "step-000000007.ckpt").touch()
         for name in ("ply", "sog")[number:]:
             folder.splat(name).write_text(f"{name} of {run}")
-        folder.note_exports(("ply", "sog")[number:])
+            folder.note_export(name)
     assert not folder.has_current_splat("ply")
     assert folder.has_current_splat("sog")
     told = folder.begin_another_run()
-    assert told.endswith("; the earlier splat is kept in " + str(tmp_path / "earlier/run-16") + ".")
+    kept = [tmp_path / "earlier/run", tmp_path / "earlier/run-16"]
+    assert told.endswith(f"; the earlier splat is kept in {kept[0]} and {kept[1]}.")
     assert (tmp_path / "earlier/run-16/splat.sog").read_text() == "sog of run-16"
     assert (tmp_path / "earlier/run/splat.ply").read_text() == "ply of run"
 

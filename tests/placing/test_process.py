@@ -1076,13 +1076,13 @@ def test_a_mask_with_transparent_parts_is_refused(tmp_path: Path, mode: str, cap
     mask.convert(mode).save(photos / "masks/b.png")
     status = main([str(photos), str(tmp_path / "out")])
     assert status == 2
-    told = "masks/b.png is a mask with transparent parts: save it without transparency, black where b.png is to be hid"
+    told = "masks/b.png is a mask whose white has transparent parts: save it without transparency, black where b.png is"
     assert told in capsys.readouterr().err
 
 
-def test_a_mask_without_transparent_parts_may_have_an_alpha_channel(tmp_path: Path):
+def test_a_mask_may_be_transparent_where_it_is_black(tmp_path: Path):
     mask = Image.new("RGBA", (32, 24), "white")
-    mask.paste("black", (0, 0, 16, 24))
+    mask.paste((0, 0, 0, 0), (0, 0, 16, 24))
     mask.save(tmp_path / "mask.png")
     photo = Photo("photo.png", (32, 24), (), False, is_panorama=False)
     write_masks(tmp_path, {"photo.png": "mask.png"}, [photo], [photo], tmp_path / "masks")
@@ -1996,6 +1996,7 @@ def test_other_masks_make_another_scene(tmp_path: Path, registered: Callable[[in
     registered(9)
     assert main(command) == 0
     (tmp_path / "out/transforms.json").write_text("{}")
+    (tmp_path / "out/masks").mkdir()
     content = mask.read_bytes()
     os.utime(mask, (0, 0))
     assert main(command) == 0
@@ -2041,8 +2042,13 @@ def test_a_mask_that_was_not_used_may_go(grown: tuple[Path, Path, dict[str, Any]
     command = [str(source), str(out), "--max-size", "120"]
     assert main(command) == 0
     assert "not used, because the scene has none" in capsys.readouterr().out
+    assert main(command) == 0, "it may also stay"
     mask.unlink()
     assert main(command) == 0
+    Image.new("L", (WIDTH, HEIGHT), 255).save(source / "01_mask.png")
+    capsys.readouterr()
+    assert main(command) == 2, "that of a photo whose cameras were found without it"
+    assert "(photos or masks added: 1, such as 01_mask.png)" in capsys.readouterr().err
 
 
 @pytest.mark.hard_case("photos put beside the videos of a scene", "refused: move them to a folder of their own")
@@ -2063,14 +2069,17 @@ def test_photos_beside_the_videos_of_a_scene_are_told(tmp_path: Path, taken: lis
 )
 def test_masks_belong_to_the_photos_that_their_paths_name(tmp_path: Path):
     views = [photo.filter(ImageFilter.GaussianBlur(3)) for photo in itertools.islice(draw_photos(), 5)]
-    names = ["IMG_1.jpg", "100CANON/IMG_1.jpg", "a.jpg", "a.png", "b/img5.jpg"]
+    names = ["IMG_1.jpg", "100CANON/IMG_1.JPG", "a.jpg", "a.png", "b/img5.jpg"]
     for name, view in zip(names, views, strict=True):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         view.rotate(90 * (name == "a.png")).save(tmp_path / name)
     expected = {
-        "IMG_1.jpg": "masks/IMG_1.png", "100CANON/IMG_1.jpg": "masks/100CANON/IMG_1.png", "a.jpg": "masks/a.jpg.png",
-        "a.png": "masks/a.png.png", "b/img5.jpg": "b/img5_mask.png",
-    }  # fmt: skip
+        "IMG_1.jpg": "masks/IMG_1.png",
+        "100CANON/IMG_1.JPG": "masks/100CANON/IMG_1.jpg.png",
+        "a.jpg": "masks/a.jpg.png",
+        "a.png": "masks/a.png.png",
+        "b/img5.jpg": "b/img5_mask.png",
+    }
     for name in [*expected.values(), "masks/img5.png"]:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("L", (WIDTH, HEIGHT), 255).save(tmp_path / name)

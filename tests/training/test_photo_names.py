@@ -10,8 +10,9 @@ from sadgs_ns.training.photo_names import common_folder, photo_names, same_photo
 
 
 def test_the_common_folder_holds_all_files():
-    assert common_folder([Path("a/b/1.png"), Path("a/c/1.png")]) == Path("a")
-    assert common_folder([Path("a/b/1.png"), Path("a/b/2.png")]) == Path("a/b")
+    assert common_folder([Path("a/b/1.png"), Path("a/c/1.png")]) == Path("a").absolute()
+    assert common_folder([Path("a/b/1.png"), Path("a/b/2.png")]) == Path("a/b").absolute()
+    assert common_folder([Path("a/b/1.png"), Path("a/c/1.png").absolute()]) == Path("a").absolute()
 
 
 def test_names_have_the_common_folder_and_all_below_it():
@@ -19,7 +20,7 @@ def test_names_have_the_common_folder_and_all_below_it():
     assert photo_names(files) == ["images/1.png", "images/2.png"]
     rig = [Path("/data/rig/left/images/1.png"), Path("/data/rig/right/images/1.png")]
     assert photo_names(rig) == ["rig/left/images/1.png", "rig/right/images/1.png"]
-    assert photo_names([Path("1.png")]) == ["1.png"]
+    assert photo_names([Path("1.png")]) == [f"{Path.cwd().name}/1.png"]
 
 
 @pytest.mark.hard_case(
@@ -35,6 +36,7 @@ def test_names_have_the_common_folder_and_all_below_it():
         pytest.param(["r/a/1.png", "r/b/1.png"], ["s/b/1.png", "s/a/1.png"], [1, 0], id="a rig, renamed"),
         pytest.param(["r/a/1.png"], ["r/a/1.png", "r/b/1.png"], [0, None], id="added to a rig"),
         pytest.param(["a/1.png", "a/2.png"], ["r/b/1.png", "r/a/1.png"], [None, 0], id="a camera added"),
+        pytest.param(["r/a/1.png", "r/b/2.png"], ["r/b/1.png", "r/b/2.png"], [None, 1], id="another of a rig"),
         pytest.param(["i/1.png", "i/1.png"], ["r/a/i/1.png", "r/b/i/1.png"], [None, None], id="cannot be told apart"),
     ],
 )

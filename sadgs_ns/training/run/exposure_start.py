@@ -80,7 +80,7 @@ def resume_with_gains(pipeline: SadgsPipeline, world: World) -> None:
             note("Gains of exposure: the checkpoint has none, and so has this run.")
         return
     if not model.may_use_gains:
-        note("Gains of exposure: the options ask for none, so those of the checkpoint are dropped.")
+        note("Gains of exposure: this run's options allow none, so those of the checkpoint are dropped.")
         model.set_exposure(None)
         return
     dataset = pipeline.datamanager.train_dataset

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -255,7 +256,7 @@ class MovedSearch:
             data = self._views.moved.masked(view, images[view])
             # A picture of one bit takes a hundredth of the time.
             picture = Image.fromarray(data["mask"][..., 0].cpu().numpy())
-            name = files[view].relative_to(root).with_suffix(".png")
+            name = Path(os.path.abspath(files[view])).relative_to(root).with_suffix(".png")
             with atomic_path(folder / name) as partial:
                 picture.save(partial, format="PNG")
         return folder

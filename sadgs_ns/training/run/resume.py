@@ -103,7 +103,7 @@ class Resumption:
         with self._errors_name_file():
             optimizers.load_optimizers(self.state["optimizers"])
             if schedulers:
-                optimizers.go_on_after(self.state["step"] + 1)
+                optimizers.go_on_after(self.state["step"] + 1, self.state.get("schedulers", {}))
         note(f"Resuming after step {self.state['step']} of {self.path}")
 
 

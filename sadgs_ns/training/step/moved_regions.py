@@ -9,8 +9,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sadgs_ns.training.photo_names import same_photos
-
 
 class MovedRegions:
     """Regions of training photos that count as little as what masks hide.
@@ -76,9 +74,8 @@ class MovedRegions:
         return {names[view]: region.cpu() for view, region in self._regions.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor], names: Sequence[str], device: torch.device) -> None:
-        """Restore regions of photos that are the same by `same_photos`."""
+        """Restore regions of photos that have the same names."""
         self._regions = {}
-        known = list(state)
-        for view, row in enumerate(same_photos(known, names)):
-            if row is not None:
-                self._regions[view] = state[known[row]].to(device)
+        for view, name in enumerate(names):
+            if name in state:
+                self._regions[view] = state[name].to(device)

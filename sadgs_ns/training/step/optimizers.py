@@ -177,17 +177,20 @@ class SadgsOptimizers(Optimizers):
             own_groups = optimizer.state_dict()["param_groups"]
             optimizer.load_state_dict({**state, "param_groups": own_groups})
 
-    def go_on_after(self, iterations: int) -> None:
-        """Set the rates to those of this run's schedules after some iterations, also where a checkpoint had none."""
-        for scheduler in self.schedulers.values():
-            assert isinstance(scheduler, LambdaLR)
-            (base,) = scheduler.base_lrs
-            (factor,) = scheduler.lr_lambdas
-            rate = base * factor(iterations)
-            scheduler.last_epoch = iterations
-            scheduler._step_count = iterations + 1
-            scheduler._last_lr = [rate]
-            scheduler.optimizer.param_groups[0]["lr"] = rate
+    def go_on_after(self, iterations: int, loaded_state: Mapping[str, Any]) -> None:
+        """Set the rates to those of this run's schedules after some iterations, also where a checkpoint had none.
+
+        Schedulers of other kinds than ours take over what the checkpoint has of them.
+        """
+        for name, scheduler in self.schedulers.items():
+            if not isinstance(scheduler, LambdaLR):
+                if name in loaded_state:
+                    scheduler.load_state_dict(loaded_state[name])
+                continue
+            # torch sets the rate of the optimizer when it makes a scheduler, and does the first step then.
+            gone_on = LambdaLR(scheduler.optimizer, scheduler.lr_lambdas, last_epoch=iterations - 1)
+            gone_on._step_count = iterations + 1
+            self.schedulers[name] = gone_on
 
     def update(self) -> AdamUpdate:
         """Return an update of all present parameters that are not empty."""

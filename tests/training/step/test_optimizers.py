@@ -193,7 +193,7 @@ def test_a_checkpoint_goes_on_in_the_other(source, target):
     for name, parameter in resumed.params.items():
         parameter.data.copy_(first.params[name].data)
     resumed.optimizers.load_optimizers(states)
-    resumed.optimizers.go_on_after(3)
+    resumed.optimizers.go_on_after(3, {})
     for step in range(3, STEPS):
         resumed.step(step)
     for step in range(STEPS):
