@@ -119,6 +119,12 @@ class WriteError(OSError):
         )
 
 
+def sentence_on_full_gpu(command: str, path: Path) -> str:
+    """Return the sentence of one of our commands on a run or file for which the GPU's memory is too small."""
+    remedy = f"end other programs on it, or work on the CPU: CUDA_VISIBLE_DEVICES= {command} …"
+    return f"{command}: the GPU's memory does not hold {path}: {remedy}"
+
+
 def check_working_directory() -> None:
     """Raise InputError if the working directory was deleted; there importing torch ends the process without a word."""
     try:

@@ -37,7 +37,8 @@ def choose_run(folder: SadgsFolder, train_options: Sequence[str]) -> None:
     if not divides(train_options):
         if settings.measure is None:
             if before and has_earlier:
-                still_there = [view for view in before if view in views]
+                present = set(views)
+                still_there = [view for view in before if view in present]
                 described |= divide_additions(described, [still_there, views])
         elif before and has_earlier:
             described |= divide(views, settings.measure, before, described.get("test_filenames", []))

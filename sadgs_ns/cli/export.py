@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sadgs_ns import formats
 from sadgs_ns.cli.program import parse
 from sadgs_ns.data.coordinates import TRANSFORMS_NAME, Similarity, from_data
-from sadgs_ns.errors import InputError, RunError, WriteError
+from sadgs_ns.errors import InputError, RunError, WriteError, sentence_on_full_gpu
 from sadgs_ns.files import check_encoding
 from sadgs_ns.formats import FORMATS, MESH, format_of, html
 from sadgs_ns.formats.gaussians import DEFAULTS, DEGREE_0, Context, Start, of_parameters
@@ -322,8 +322,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         if not isinstance(error, torch.cuda.OutOfMemoryError):
             raise
-        remedy = "end other programs on it, or work on the CPU: CUDA_VISIBLE_DEVICES= sadgs-export …"
-        print(f"sadgs-export: the GPU's memory does not hold {options.run}: {remedy}", file=sys.stderr)
+        print(sentence_on_full_gpu("sadgs-export", options.run), file=sys.stderr)
         return 2
     parts = "Gaussians"
     if format_of(options.output) == MESH:

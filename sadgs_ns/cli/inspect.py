@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from sadgs_ns.cli.program import parse
+from sadgs_ns.errors import sentence_on_full_gpu
 
 
 @dataclass
@@ -50,8 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"sadgs-inspect: {error}", file=sys.stderr)
         return 2
     except torch.cuda.OutOfMemoryError:
-        remedy = "end other programs on it, or draw on the CPU: CUDA_VISIBLE_DEVICES= sadgs-inspect …"
-        print(f"sadgs-inspect: the GPU's memory does not hold {options.config}: {remedy}", file=sys.stderr)
+        print(sentence_on_full_gpu("sadgs-inspect", options.config), file=sys.stderr)
         return 2
     for path in written:
         print(path)

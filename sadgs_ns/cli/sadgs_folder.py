@@ -172,7 +172,7 @@ class SadgsFolder:
         for name in FORMAT_NAMES:
             splat = self.splat(name)
             if splat.is_file():
-                run = self.settings.exported.get(name, self.settings.run).split("/")[0]
+                run = _run_of(self.settings.exported.get(name, self.settings.run))
                 kept = self.path / "earlier" / run
                 kept.mkdir(parents=True, exist_ok=True)
                 os.replace(splat, kept / splat.name)
@@ -224,8 +224,16 @@ class SadgsFolder:
 
     def note_export(self, format_name: str) -> None:
         """Note that the splat in a format is of the last checkpoint."""
-        self.settings.exported[format_name] = self._name_of_checkpoint()
+        checkpoint = self.checkpoint()
+        assert checkpoint is not None, "there is one after training"
+        self.settings.exported[format_name] = self._note_of(checkpoint)
         self.write_settings()
+
+    def forget_exports_of_run(self) -> None:
+        """Forget which splats are of the present run, which begins: its folder may have been deleted."""
+        for name, note in list(self.settings.exported.items()):
+            if _run_of(note) == self.settings.run:
+                del self.settings.exported[name]
 
     def has_current_splat(self, format_name: str) -> bool:
         """Return whether a splat is of the last checkpoint, as was noted.
@@ -238,14 +246,17 @@ class SadgsFolder:
             return False
         noted = self.settings.exported.get(format_name)
         if noted is not None:
-            return noted == self._name_of_checkpoint()
+            return noted == self._note_of(checkpoint)
         return splat.stat().st_mtime >= checkpoint.stat().st_mtime
 
-    def _name_of_checkpoint(self) -> str:
-        """Return the run and the name of its last checkpoint."""
-        checkpoint = self.checkpoint()
-        assert checkpoint is not None, "there is one after training"
+    def _note_of(self, checkpoint: Path) -> str:
+        """Return what `exported` notes of a splat: the present run and its checkpoint."""
         return f"{self.settings.run}/{checkpoint.name}"
+
+
+def _run_of(note: str) -> str:
+    """Return the run in a note of `exported`."""
+    return note.partition("/")[0]
 
 
 def _shown(value: Any) -> str:

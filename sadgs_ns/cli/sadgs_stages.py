@@ -118,7 +118,7 @@ def train(work: PhotosToSplat, line: StatusLine) -> str:
         line.update("going on")
     else:
         line.update("starting")
-        results.settings.exported = {}
+        results.forget_exports_of_run()
         if work.given is not None:
             results.settings.files = work.given.stamp_images()
     results.write_settings()
@@ -181,10 +181,9 @@ def export(work: PhotosToSplat, line: StatusLine) -> str:
     """Export the splat as `sadgs-export` does, in each format that has no file of the last checkpoint yet."""
     jobs = []
     progress = _ExportProgress(work, line)
-    stale = [name for name in work.formats if not work.results.has_current_splat(name)]
     for name in work.formats:
         output = work.results.splat(name)
-        if name not in stale:
+        if work.results.has_current_splat(name):
             progress.finished.append(f"{output}; done before")
         else:
             title = None
@@ -214,13 +213,14 @@ class _ExportProgress:
         self.finished: list[str] = []  # Sentences on files that are there and have no line yet
 
     def on_event(self, event: str, output: str) -> None:
+        format_name = Path(output).name.removeprefix("splat.")
         if event == "export begins":
             while self.finished:
                 self._line.finish(self.finished.pop(0))
             self._line.update(output)
-            self._work.timeline.begin("export", Path(output).name.removeprefix("splat."))
+            self._work.timeline.begin("export", format_name)
         elif event == "export ends":
-            self._work.results.note_export(Path(output).name.removeprefix("splat."))
+            self._work.results.note_export(format_name)
             megabytes = Path(output).stat().st_size / 1e6
             self.finished.append(f"{output}, {megabytes:,.1f} MB")
 

@@ -37,9 +37,10 @@ def publish(undistorted: Path, out: Path, grown: bool) -> None:
         described["frames"] = [
             frame for frame in described["frames"] if not _is_taken_out(frame["file_path"], known, undistorted, out)
         ]
-        images = [frame["file_path"] for frame in described["frames"]]
+        remaining = {frame["file_path"] for frame in described["frames"]}
         for key in _LISTS & described.keys():
-            described[key] = [name for name in described[key] if name in images]
+            described[key] = [name for name in described[key] if name in remaining]
+        images = [name for name in images if name in remaining]
         images = [name for name in images if (undistorted / name).exists() or name not in known]
     file.write_text(json.dumps(described, indent=4))
     written = images + masks

@@ -140,9 +140,8 @@ class Scene:
         if self.finished or begun.has_noted_masks:
             masks = [self.masks[name] for name in photos if name in self.masks]
         stamps = begun.files
-        if (
-            self.finished and not self.is_video and not self.has_masks
-        ):  # Masks of added photos were not used: they may go.
+        has_unused_masks = self.finished and not self.is_video and not self.has_masks
+        if has_unused_masks:  # Those of added photos, which may go.
             stamps = {name: stamp for name, stamp in stamps.items() if name in begun.photos or name in masks}
         return changes_of(source, stamps, photos + masks)
 

@@ -13,10 +13,14 @@ def common_folder(files: Sequence[Path]) -> Path:
     return Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
 
 
+def paths_from(folder: Path, files: Sequence[Path]) -> list[Path]:
+    """Return the paths of files from a folder, whose path is absolute, that holds them; theirs may be relative."""
+    return [Path(os.path.abspath(file)).relative_to(folder) for file in files]
+
+
 def photo_names(files: Sequence[Path]) -> list[str]:
     """Return the path of each photo from the folder that holds all, with the name of this folder before it."""
-    root = common_folder(files).parent
-    return [Path(os.path.abspath(file)).relative_to(root).as_posix() for file in files]
+    return [path.as_posix() for path in paths_from(common_folder(files).parent, files)]
 
 
 def same_photos(before: Sequence[str], now: Sequence[str]) -> list[int | None]:

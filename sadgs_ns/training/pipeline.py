@@ -394,8 +394,8 @@ class SadgsPipeline(VanillaPipeline):
             "camera_positions": camera_positions(self.datamanager.train_dataset.cameras),
         }
         if len(self.views.moved):
-            state["moved"] = self.views.moved.state_dict(self._photo_names)
             state["photo_names"] = self._photo_names
+            state["moved"] = self.views.moved.state_dict(state["photo_names"])
         if self.device.type == "cuda":
             state["cuda"] = torch.cuda.get_rng_state(self.device)
         return state

@@ -715,6 +715,9 @@ def test_splats_of_different_runs_are_kept_apart(tmp_path: Path):
             folder.note_export(name)
     assert not folder.has_current_splat("ply")
     assert folder.has_current_splat("sog")
+    folder.forget_exports_of_run()
+    assert folder.settings.exported == {"ply": "run/step-000000007.ckpt"}, "what is of another run stays noted"
+    folder.note_export("sog")
     told = folder.begin_another_run()
     kept = [tmp_path / "earlier/run", tmp_path / "earlier/run-16"]
     assert told.endswith(f"; the earlier splat is kept in {kept[0]} and {kept[1]}.")

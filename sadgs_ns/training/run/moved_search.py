@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from sadgs_ns.geometry.moved import Group, SmallView, Spread
 from sadgs_ns.geometry.stereo_neighbours import choose_neighbours
 from sadgs_ns.method.schedule import DENSIFICATION_SHARE
 from sadgs_ns.render.types import Cameras, Gaussians
-from sadgs_ns.training.photo_names import common_folder
+from sadgs_ns.training.photo_names import common_folder, paths_from
 from sadgs_ns.training.run.progress import warn
 from sadgs_ns.training.step.color_matrices import anchored, correct_colors
 from sadgs_ns.training.step.images import thread_count
@@ -250,13 +249,13 @@ class MovedSearch:
     def _write_masks(self, folder: Path) -> Path:
         """Write a black and white mask of each photo that has a region, and return the folder."""
         files = self._views.datamanager.train_dataset.image_filenames
-        root = common_folder(files)
+        names = paths_from(common_folder(files), files)
         images = self._views.datamanager.cached_train
         for view in self._views.moved.views:
             data = self._views.moved.masked(view, images[view])
             # A picture of one bit takes a hundredth of the time.
             picture = Image.fromarray(data["mask"][..., 0].cpu().numpy())
-            name = Path(os.path.abspath(files[view])).relative_to(root).with_suffix(".png")
+            name = names[view].with_suffix(".png")
             with atomic_path(folder / name) as partial:
                 picture.save(partial, format="PNG")
         return folder
